@@ -98,7 +98,7 @@ def test_masked_outliers_count_no_longer(instead: Any, monkeypatch: pytest.Monke
     assert not mask[:, 48:].any()
     assert all(view.full.mask is None for view in run.views[1:])
     for each in (run, unchanged):
-        each.upcoming = [0, 1]
+        each.state.upcoming = (0, 1)
         each.advance()
     assert run.loss == unchanged.loss, "nothing is masked on photo 1"
     for each in (run, unchanged):

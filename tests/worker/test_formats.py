@@ -22,8 +22,8 @@ def test_the_plan_and_the_checkpoint_of_an_interrupted_job_are_kept() -> None:
     assert (plan.max_gaussians, plan.seed, plan.kernels) == (400, 1, "cpu")
     snapshot = checkpoint.load(V1 / "work" / "checkpoints")
     assert snapshot is not None
-    assert snapshot.step > 20
-    assert snapshot.budget.steps == 900_000
+    assert snapshot.state.step > 20
+    assert snapshot.state.budget.steps == 900_000
     assert {len(tensor) for tensor in snapshot.parameters.values()} == {400}
     assert "still_0002.jpg" in snapshot.view_names
 

@@ -58,11 +58,11 @@ def run(
 
     def recorded_save(directory: Path, snapshot: Snapshot) -> None:
         save(directory, snapshot)
-        record(job, "stored", step=snapshot.step)
+        record(job, "stored", step=snapshot.state.step)
 
     def recorded_load(directory: Path) -> Snapshot | None:
         snapshot = load(directory)
-        record(job, "resume", step=0 if snapshot is None else snapshot.step)
+        record(job, "resume", step=0 if snapshot is None else snapshot.state.step)
         return snapshot
 
     with patch.multiple(checkpoint, save=recorded_save, load=recorded_load):

@@ -10,6 +10,7 @@ import itertools
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -45,6 +46,16 @@ class Holder:
             name: getattr(self.held, name)
             for name in ("means", "log_scales", "quats", "logit_opacities", "sh")
         }
+
+
+def seen(engine: Holder, progress: float, seconds: float, step: int) -> Any:
+    """What is asked of a run that holds a scene."""
+    return SimpleNamespace(
+        engine=engine,
+        progress=progress,
+        clock=SimpleNamespace(seconds=seconds),
+        state=SimpleNamespace(step=step),
+    )
 
 
 def trained(capture: Path, work: Path, cancelled: Callable[[], bool] = lambda: False) -> pipeline.Outcome:
@@ -100,8 +111,9 @@ def test_snapshots_take_a_hundredth_of_the_training(
     for _ in range(1000):  # 100 seconds of training
         now += 0.1
         progress = next(steps) / 1000
-        if lapse.is_due(progress):
-            lapse.observe(Slow(), progress, now, round(1000 * progress))  # type: ignore[arg-type]  # all that is asked of it
+        run = seen(Slow(), progress, now, round(1000 * progress))
+        if lapse.is_due(run):
+            lapse.observe(run)
     taken = len(list(tmp_path.glob("*.ply")))
     assert fewest <= taken <= most
     assert lapse.seconds <= max(SHARE * 100.0, cost) + 1e-9
@@ -110,9 +122,9 @@ def test_snapshots_take_a_hundredth_of_the_training(
 def test_the_snapshots_after_a_checkpoint_are_taken_again(tmp_path: Path) -> None:
     lapse = TimeLapse(tmp_path, WORLD, anew=True)
     for step in (10, 20, 30):
-        lapse.observe(Holder(), step / 100, 1.0, step)  # type: ignore[arg-type]  # all that is asked of it
+        lapse.observe(seen(Holder(), step / 100, 1.0, step))
     again = TimeLapse(tmp_path, WORLD, anew=False)
-    again.observe(Holder(5), 0.2, 1.0, 20)  # type: ignore[arg-type]  # all that is asked of it
+    again.observe(seen(Holder(5), 0.2, 1.0, 20))
     rows = again.publish(tmp_path / "out") if (tmp_path / "out").mkdir() is None else []
     assert [(row["step"], row["gaussians"]) for row in rows] == [(10, 10), (20, 5)]
     assert sorted(path.name for path in (tmp_path / "out" / "time_lapse").iterdir()) == ["000.ply", "001.ply"]

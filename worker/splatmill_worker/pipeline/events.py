@@ -10,7 +10,7 @@ from splatmill_worker.splat.engine.protocol import Engine
 from splatmill_worker.splat.picture import save_jpeg
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.train.curve import CurvePoint
-from splatmill_worker.splat.train.loop import TrainingProgress
+from splatmill_worker.splat.train.observers import TrainingProgress
 from splatmill_worker.splat.train.renderer import render_view
 from splatmill_worker.splat.views import TrainingView
 

@@ -20,11 +20,11 @@ from splatmill.schema import CamerasEvent, Event, PlacedCamera, Placement, Snaps
 from splatmill_worker.scene import Camera, Scene
 from splatmill_worker.sfm.placed import Placed
 from splatmill_worker.splat.engine.open import gaussians_of
-from splatmill_worker.splat.engine.protocol import Engine
 from splatmill_worker.splat.formats import compressed_ply
 from splatmill_worker.splat.formats.contents import MIN_OPACITY
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.report.export import ExportWorld, spec_of
+from splatmill_worker.splat.train.run import TrainingRun
 
 INTERVAL = 2.0
 """Fewest seconds between two looks."""
@@ -116,20 +116,23 @@ class LiveScene:
         self._looks, self._antialiased = looks, antialiased
         self._scale = 1.0 / world.normalization.scale
         self._shift = torch.from_numpy(-self._scale * world.normalization.translation - world.offset)
-        self._step = 0
 
-    def is_due(self, progress: float) -> bool:
+    def is_due(self, run: TrainingRun) -> bool:
         """Whether to show the scene now."""
         return self._looks.is_due()
 
-    def observe(self, engine: Engine, progress: float, seconds: float, step: int) -> None:
-        """Show what `engine` holds after `step` steps, `seconds` into the training."""
+    def observe(self, run: TrainingRun) -> None:
+        """Show the scene as it is."""
         with self._looks.one():
-            scene = gaussians_of(engine)
+            scene = gaussians_of(run.engine)
             shown = most_covering(scene.padded(0), MOST_GAUSSIANS).moved(self._scale, self._shift)
             ply = compressed_ply.encode(shown, antialiased=self._antialiased)
             event = SnapshotEvent(
-                step=step, seconds=seconds, gaussians=scene.count, shown=shown.count, bytes=len(ply)
+                step=run.state.step,
+                seconds=run.clock.seconds,
+                gaussians=scene.count,
+                shown=shown.count,
+                bytes=len(ply),
             )
             self._looks.onlookers.show(ply, event)
 

@@ -14,9 +14,9 @@ from splatmill.files import replacing
 from splatmill.schema import format_duration
 from splatmill_worker.film import Film, with_even_sides
 from splatmill_worker.images.guarded import own_picture
-from splatmill_worker.splat.engine.protocol import Engine
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.train.renderer import render_view
+from splatmill_worker.splat.train.run import TrainingRun
 from splatmill_worker.splat.views import TrainingView
 
 INTERVALS = 96
@@ -52,19 +52,19 @@ class ProgressFilm:
         self._next = max(taken, default=-1) + 1
         self.seconds = 0.0
 
-    def is_due(self, progress: float) -> bool:
+    def is_due(self, run: TrainingRun) -> bool:
         """Whether a frame is to be taken at this share of the budget."""
-        return self._next < len(TAKEN_AT) and TAKEN_AT[self._next] <= progress
+        return self._next < len(TAKEN_AT) and TAKEN_AT[self._next] <= run.progress
 
-    def observe(self, engine: Engine, progress: float, seconds: float, step: int) -> None:
-        """Take the frame that is due, `seconds` into the training."""
+    def observe(self, run: TrainingRun) -> None:
+        """Take the frame that is due."""
         started = time.perf_counter()
-        color = render_view(engine, self._plan, self._view)
+        color = render_view(run.engine, self._plan, self._view)
         picture = Image.fromarray(
             with_even_sides((color.detach().clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy())
         )
-        _caption(picture, f"{format_duration(seconds)}   {engine.count:,} Gaussians")
-        while self.is_due(progress):
+        _caption(picture, f"{format_duration(run.clock.seconds)}   {run.engine.count:,} Gaussians")
+        while self.is_due(run):
             self._next += 1
         path = self._folder / f"{self._next - 1:03d}.jpg"
         with replacing(path) as part:

@@ -15,9 +15,9 @@ from splatmill.files import atomic_write
 from splatmill.schema import TIME_LAPSE
 from splatmill_worker.pipeline.live import most_covering
 from splatmill_worker.splat.engine.open import gaussians_of
-from splatmill_worker.splat.engine.protocol import Engine
 from splatmill_worker.splat.formats import compressed_ply
 from splatmill_worker.splat.report.export import ExportWorld
+from splatmill_worker.splat.train.run import TrainingRun
 
 MOST = 24
 """Snapshots of a model."""
@@ -68,8 +68,9 @@ class TimeLapse:
         self._last = 0.0
         self.seconds = 0.0
 
-    def is_due(self, progress: float) -> bool:
+    def is_due(self, run: TrainingRun) -> bool:
         """Whether to take a snapshot at this share of the budget. A moment that would cost too much is passed over."""
+        progress = run.progress
         if self._next is None:  # the first look of this attempt
             self._began, self._from = self._clock(), progress
             self._next = sum(share < progress for share in TAKEN_AT) if self._taken else 0
@@ -85,16 +86,16 @@ class TimeLapse:
         whole = passed * (1.0 - self._from) / max(progress - self._from, 1e-6)
         return SHARE * whole * (self._next or 0) / MOST
 
-    def observe(self, engine: Engine, progress: float, seconds: float, step: int) -> None:
-        """Keep what `engine` holds after `step` steps, `seconds` into the training."""
-        started = self._clock()
+    def observe(self, run: TrainingRun) -> None:
+        """Keep the scene as it is."""
+        started, step = self._clock(), run.state.step
         if not self.seconds:
             self._drop_from(step)
-        scene = gaussians_of(engine)
+        scene = gaussians_of(run.engine)
         shown = most_covering(scene.padded(0), MOST_GAUSSIANS).moved(self._scale, self._shift)
         path = self._folder / f"{self._taken:03d}.ply"
         atomic_write(path, compressed_ply.encode(shown, antialiased=self._antialiased))
-        facts = {"step": step, "seconds": seconds, "gaussians": scene.count, "shown": shown.count}
+        facts = {"step": step, "seconds": run.clock.seconds, "gaussians": scene.count, "shown": shown.count}
         # Written after the snapshot, so that one without it is not counted and is written again.
         atomic_write(path.with_suffix(".json"), json.dumps(facts))
         self._taken += 1

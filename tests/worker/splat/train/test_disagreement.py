@@ -111,7 +111,7 @@ def test_photos_are_compared_once_before_they_are_learnt_by_heart(
 
     def record(run: TrainingRun, learnt: Sequence[int]) -> tuple[Disagreement, ...]:
         assert list(learnt) == list(range(photos))
-        compared.append(run.step)
+        compared.append(run.state.step)
         return ()
 
     monkeypatch.setattr(disagreement, "disagreements", record)

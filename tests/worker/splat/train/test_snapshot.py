@@ -111,20 +111,25 @@ def test_a_checkpoint_of_the_code_before_snapshots_is_resumed(tmp_path: Path) ->
     assert snapshot is not None
     run = a_run(course())
     run.resume(snapshot)
-    assert (run.step, run.recoveries, run.rate_scale, run.max_gaussians) == (120, 1, 0.5, 3000)
-    assert (run.shortened, run.ever_visible, run.upcoming) == (True, True, [4, 7, 1])
-    assert run.budget.steps == 180
+    assert (run.state.step, run.state.recoveries, run.state.rate_scale, run.state.max_gaussians) == (
+        120,
+        1,
+        0.5,
+        3000,
+    )
+    assert (run.state.shortened, run.state.ever_visible, run.state.upcoming) == (True, True, (4, 7, 1))
+    assert run.state.budget.steps == 180
     assert run.clock.seconds == pytest.approx(3.5, abs=0.5)
-    assert [point.step for point in run.curve] == [40, 80]
-    assert run.curve[0].train_psnr == 16.0
-    assert run.curve[1].memory is None
+    assert [point.step for point in run.state.curve] == [40, 80]
+    assert run.state.curve[0].train_psnr == 16.0
+    assert run.state.curve[1].memory is None
     held = run.snapshot()
     assert torch.equal(held.random, stored["random"])
     for name in ("parameters", "exp_avg", "exp_avg_sq", "poses"):
         pairs = zip(flat(getattr(held, name)), flat(stored[name]), strict=True)
         assert all(torch.equal(a, b) for a, b in pairs), name
     advanced(run, 60)
-    assert run.step == 180
+    assert run.state.step == 180
     assert run.progress == 1.0
     assert bool(torch.isfinite(run.engine.parameters()["means"]).all())
 
@@ -160,14 +165,14 @@ def test_a_roll_back_restores_what_is_optimised_and_nothing_else() -> None:
     run = advanced(a_run(replace(course(), densify=False)), 60)
     good, before = run.last_good, run.snapshot()
     assert good is not None
-    assert good.step < 60
+    assert good.state.step < 60
     run.roll_back(TrainingFailed(FailureName.divergence, "the loss rose.", step=60))
     after = run.snapshot()
     optimised = {"parameters", "exp_avg", "exp_avg_sq", "poses"}
     others = {field.name for field in fields(Snapshot)} - optimised
     same(after, good, but=others)
-    same(after, before, but=optimised | {"seconds", "recoveries", "rate_scale", "lowest_loss"})
-    assert (after.recoveries, after.rate_scale) == (1, 0.5)
+    same(after, before, but=optimised | {"seconds", "state", "lowest_loss"})
+    assert after.state == replace(before.state, recoveries=1, rate_scale=0.5)
     assert after.lowest_loss == good.lowest_loss
 
 
@@ -175,8 +180,8 @@ def test_after_a_shortage_of_memory_the_most_opaque_gaussians_are_kept() -> None
     run = advanced(a_run(replace(course(), densify=False)), 10)
     count = run.engine.count
     run.roll_back(TrainingFailed(FailureName.memory, "no room.", step=10))
-    assert run.max_gaussians == run.engine.count == int(0.8 * count)
-    assert run.rate_scale == 1.0
+    assert run.state.max_gaussians == run.engine.count == int(0.8 * count)
+    assert run.state.rate_scale == 1.0
     good = run.last_good
     assert good is not None
     assert good.exp_avg.shape[0] == good.exp_avg_sq.shape[0] == int(0.8 * count)

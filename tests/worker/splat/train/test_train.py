@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-import time
 from dataclasses import replace
-from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -24,8 +22,9 @@ from splatmill_worker.splat.plan.budget import Budget, Clock
 from splatmill_worker.splat.plan.rates import Annealing, boost_of
 from splatmill_worker.splat.start import frusta
 from splatmill_worker.splat.start.points import from_points
-from splatmill_worker.splat.train import checkpoint, curve, loop
-from splatmill_worker.splat.train.loop import Hooks, TrainingProgress, train
+from splatmill_worker.splat.train import checkpoint, curve, observers
+from splatmill_worker.splat.train.loop import Hooks, train
+from splatmill_worker.splat.train.observers import TrainingProgress
 from splatmill_worker.splat.train.renderer import evaluation_background
 from splatmill_worker.splat.train.run import TrainingRun
 from splatmill_worker.splat.train.snapshot import Snapshot
@@ -158,7 +157,7 @@ def test_a_resumed_run_goes_on_where_it_was(tmp_path: Path) -> None:
         pass
 
     def save_and_die(snapshot: Snapshot) -> None:
-        if snapshot.step >= 100:
+        if snapshot.state.step >= 100:
             checkpoint.save(tmp_path, snapshot)
             raise PowerCutError
 
@@ -169,7 +168,7 @@ def test_a_resumed_run_goes_on_where_it_was(tmp_path: Path) -> None:
         )  # fmt: skip
     snapshot = checkpoint.load(tmp_path)
     assert snapshot is not None
-    assert snapshot.step == 100
+    assert snapshot.state.step == 100
     resumed = train(first_engine(), views, held_out, whole, extent=1.1, resume_from=snapshot)
     straight = train(first_engine(), views, held_out, whole, extent=1.1)
     assert resumed.steps == 240
@@ -186,23 +185,33 @@ def test_a_run_that_had_ended_is_evaluated_when_resumed() -> None:
     whole = plan(40, densify=False)
     hooks = Hooks(checkpoint=last.append, checkpoint_seconds=0.0)
     train(first_engine(), views, held_out, whole, extent=1.1, hooks=hooks)
-    assert last[-1].step == 39
-    ended = replace(last[-1], step=40)
+    assert last[-1].state.step == 39
+    ended = replace(last[-1], state=replace(last[-1].state, step=40))
     resumed = train(first_engine(), views, held_out, whole, extent=1.1, resume_from=ended)
     assert resumed.curve[-1].step == resumed.steps
     assert resumed.held_out is not None
 
 
 def test_checkpoints_are_close_at_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By a clock that advances a second at each look: one in each step, and one after each checkpoint."""
-    clock = SimpleNamespace(monotonic=count().__next__, perf_counter=time.perf_counter)
-    monkeypatch.setattr(loop, "time", clock)
+    """By a clock that advances by a second before each step."""
+    now = 0
+
+    def tick() -> bool:
+        nonlocal now
+        now += 1
+        return False
+
+    monkeypatch.setattr(observers, "time", SimpleNamespace(monotonic=lambda: now))
     views, held_out = split()
     stored: list[int] = []
-    hooks = Hooks(checkpoint=lambda snapshot: stored.append(snapshot.step), checkpoint_seconds=10.0)
+    hooks = Hooks(
+        cancelled=tick,
+        checkpoint=lambda snapshot: stored.append(snapshot.state.step),
+        checkpoint_seconds=10.0,
+    )
     train(first_engine(), views, held_out, plan(40, densify=False), extent=1.1, hooks=hooks)
-    # After 3 s, the first look past 2.5; after another 4 and 9, as long as since the beginning; then after 10 each.
-    assert stored == [3, 7, 16, 26, 36]
+    # After 3 s, the first step past 2.5; after another 3 and 6, as long as since the beginning; then after 10 each.
+    assert stored == [3, 6, 12, 22, 32]
 
 
 def test_a_cancel_is_seen_at_the_next_step() -> None:
@@ -302,8 +311,8 @@ def test_a_resumed_run_sets_the_same_photos_aside() -> None:
     kept: list[Snapshot] = []
     hooks = Hooks(checkpoint=kept.append, checkpoint_seconds=0.0)
     train(first_engine(), views, held_out, course, extent=1.1, hooks=hooks)
-    middle = next(snapshot for snapshot in kept if snapshot.step == 100)
-    late = next(snapshot for snapshot in kept if snapshot.step == 170)
+    middle = next(snapshot for snapshot in kept if snapshot.state.step == 100)
+    late = next(snapshot for snapshot in kept if snapshot.state.step == 170)
     for snapshot, aside in ((middle, True), (late, False)):
         engine = Seen(first_engine())
         resumed = train(engine, views, held_out, course, extent=1.1, resume_from=snapshot)

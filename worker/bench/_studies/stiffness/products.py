@@ -8,7 +8,7 @@ import torch
 from _rows import Row
 from torch import Tensor
 
-from splatmill_worker.splat.engine.protocol import Engine
+from splatmill_worker.splat.train.run import TrainingRun
 
 from . import exact
 from .curvature import GREY, LIMIT, Objective, product, start
@@ -76,7 +76,8 @@ def asymmetry(apply: Callable[[Tensor], Tensor], u: Tensor, v: Tensor) -> float:
 class Sampled(Probe):
     """Measures the products in place of the eigenvalues."""
 
-    def observe(self, engine: Engine, progress: float, seconds: float, step: int) -> None:
+    def observe(self, run: TrainingRun) -> None:
+        progress, step = run.progress, run.state.step
         self._next += 1
-        state = State.of(self.small, engine, self.plan, progress, step, 0.5 ** len(self.warnings))
+        state = State.of(self.small, run.engine, self.plan, progress, step, 0.5 ** len(self.warnings))
         self.rows += [{**row, "share_of_budget": progress} for row in measure(state)]

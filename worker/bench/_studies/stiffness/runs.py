@@ -22,6 +22,7 @@ from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.plan.rates import RateSchedule
 from splatmill_worker.splat.train.evaluations import evenly
 from splatmill_worker.splat.train.loop import Hooks, Trained, train
+from splatmill_worker.splat.train.run import TrainingRun
 
 from . import mean_square
 from .curvature import COLUMNS, LIMIT, Metric, Objective, Shot, joined, parted, product, shots, start
@@ -144,12 +145,13 @@ class Probe:
         """A training with this plan begins, which puts a sentence into `warnings` at each roll-back."""
         self.plan, self.warnings, self._next = plan, warnings, 0
 
-    def is_due(self, progress: float) -> bool:
-        return self._next < len(self.shares) and progress >= self.shares[self._next]
+    def is_due(self, run: TrainingRun) -> bool:
+        return self._next < len(self.shares) and run.progress >= self.shares[self._next]
 
-    def observe(self, engine: Engine, progress: float, seconds: float, step: int) -> None:
+    def observe(self, run: TrainingRun) -> None:
+        progress, step = run.progress, run.state.step
         self._next += 1
-        state = State.of(self.small, engine, self.plan, progress, step, 0.5 ** len(self.warnings))
+        state = State.of(self.small, run.engine, self.plan, progress, step, 0.5 ** len(self.warnings))
         self.rows.append(
             {"part": "curvature", "share": progress, "step": step, **measure(state, self.tolerance)}
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import pickle
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
@@ -13,13 +13,19 @@ import torch
 from splatmill.files import replacing
 from splatmill_worker.splat.plan.budget import Budget
 from splatmill_worker.splat.train.curve import CurvePoint
-from splatmill_worker.splat.train.snapshot import Snapshot
+from splatmill_worker.splat.train.snapshot import RunState, Snapshot
 
 NAME = "checkpoint.pt"
 log = logging.getLogger("splatmill_worker")
 
 FORMAT = 1
 """Number of the file's format: the keys of `_encoded`. A file with another number is not read."""
+
+TENSORS = ("parameters", "exp_avg", "exp_avg_sq", "poses", "random")
+"""Fields of a snapshot that are stored under their own names."""
+
+NAMES = {"curve": "rows", "upcoming": "order", "max_gaussians": "most", "ever_visible": "ever_saw"}
+"""Names in the file of the fields of a state that have another one there."""
 
 
 def save(directory: Path, snapshot: Snapshot) -> None:
@@ -75,43 +81,24 @@ def load(directory: Path) -> Snapshot | None:
 
 def _encoded(snapshot: Snapshot) -> dict[str, Any]:
     """The file's plain values and tensors by key."""
+    state = asdict(snapshot.state)
     return {
         "format": FORMAT,
-        "parameters": snapshot.parameters,
-        "exp_avg": snapshot.exp_avg,
-        "exp_avg_sq": snapshot.exp_avg_sq,
-        "step": snapshot.step,
+        **{name: getattr(snapshot, name) for name in TENSORS},
         "seconds": snapshot.seconds,
-        "rows": [asdict(point) for point in snapshot.curve],
-        "recoveries": snapshot.recoveries,
-        "rate_scale": snapshot.rate_scale,
-        "order": list(snapshot.upcoming),
-        "random": snapshot.random,
         "views": list(snapshot.view_names),
-        "poses": snapshot.poses,
-        "budget": asdict(snapshot.budget),
-        "shortened": snapshot.shortened,
-        "most": snapshot.max_gaussians,
-        "ever_saw": snapshot.ever_visible,
+        **{NAMES.get(name, name): list(v) if isinstance(v, tuple) else v for name, v in state.items()},
     }
 
 
 def _decoded(state: dict[str, Any]) -> Snapshot:
+    values = {name: state[NAMES.get(name, name)] for name in (each.name for each in fields(RunState))}
+    values["budget"] = Budget(**values["budget"])
+    values["curve"] = tuple(CurvePoint(**row) for row in values["curve"])
+    values["upcoming"] = tuple(values["upcoming"])
     return Snapshot(
-        parameters=state["parameters"],
-        exp_avg=state["exp_avg"],
-        exp_avg_sq=state["exp_avg_sq"],
-        poses=state["poses"],
-        step=state["step"],
+        **{name: state[name] for name in TENSORS},
+        state=RunState(**values),
         seconds=state["seconds"],
-        budget=Budget(**state["budget"]),
-        shortened=state["shortened"],
-        curve=tuple(CurvePoint(**row) for row in state["rows"]),
-        recoveries=state["recoveries"],
-        rate_scale=state["rate_scale"],
-        max_gaussians=state["most"],
-        upcoming=tuple(state["order"]),
-        random=state["random"],
-        ever_visible=state["ever_saw"],
         view_names=tuple(state["views"]),
     )

@@ -73,22 +73,22 @@ class Look:
         self._found: tuple[Disagreement, ...] | None = None
         self.seconds = 0.0
 
-    @property
-    def is_due(self) -> bool:
+    def is_due(self, run: TrainingRun) -> bool:
         """Whether to compare them now. A run that goes on from a checkpoint compares them again."""
-        run = self._run
-        return self._found is None and (run.step >= VISITS * len(self._compared) or run.progress >= LATEST)
+        return self._found is None and (
+            run.state.step >= VISITS * len(self._compared) or run.progress >= LATEST
+        )
 
-    def take(self) -> None:
+    def observe(self, run: TrainingRun) -> None:
         """Compare the photos with what the run's engine holds."""
         started = time.perf_counter()
-        self._found = disagreements(self._run, self._compared)
+        self._found = disagreements(run, self._compared)
         self.seconds = time.perf_counter() - started
 
     def finish(self) -> tuple[Disagreement, ...]:
         """What was found; of the end of the run where it ended before the photos were compared."""
         if self._found is None:
-            self.take()
+            self.observe(self._run)
         return self._found or ()
 
 

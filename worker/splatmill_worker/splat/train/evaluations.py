@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
 
+from splatmill_worker.splat.engine.protocol import Engine
 from splatmill_worker.splat.evaluate import Score, evaluate
 from splatmill_worker.splat.machine import resident_memory
 from splatmill_worker.splat.train.curve import CurvePoint
 from splatmill_worker.splat.train.renderer import evaluation_background, renderer
 from splatmill_worker.splat.train.run import TrainingRun
+from splatmill_worker.splat.train.stopping import reason_to_stop
 from splatmill_worker.splat.views import TrainingView
 
 View = TypeVar("View")
@@ -92,8 +94,14 @@ class Evaluations:
     final: the scores of the last evaluation where that was at the end of the budget; None before.
     """
 
-    def __init__(self, run: TrainingRun, held_out: Sequence[TrainingView]) -> None:
-        self._run, self._held_out = run, held_out
+    def __init__(
+        self,
+        run: TrainingRun,
+        held_out: Sequence[TrainingView],
+        evaluated: Callable[[CurvePoint, Engine], None] = lambda _point, _engine: None,
+    ) -> None:
+        """evaluated: called with every new point of the curve."""
+        self._run, self._held_out, self._evaluated = run, held_out, evaluated
         aside = len(run.set_aside)
         self._chosen = curve_views(
             len(held_out), len(run.views) - aside, run.plan.schedule.expected_steps, aside
@@ -104,10 +112,14 @@ class Evaluations:
         passed = sum(share <= run.progress for share in self._chosen.shares)
         self._next = min(passed, len(self._chosen.shares) - 1)
 
-    @property
-    def due(self) -> bool:
+    def is_due(self, run: TrainingRun) -> bool:
         """Whether the next share of the budget is reached."""
-        return self._run.progress >= self._chosen.shares[self._next]
+        return run.progress >= self._chosen.shares[self._next]
+
+    def observe(self, run: TrainingRun) -> None:
+        """Evaluate, and decide whether the run ends."""
+        self._evaluated(self.evaluate(), run.engine)
+        run.stopped = reason_to_stop(run)
 
     @property
     def last_is_next(self) -> bool:
@@ -132,7 +144,7 @@ class Evaluations:
         held_out = scores.held_out
         point = CurvePoint(
             seconds=run.clock.seconds,
-            step=run.step,
+            step=run.state.step,
             loss=run.loss,
             psnr=None if held_out is None else held_out.psnr,
             ssim=None if held_out is None else held_out.ssim,
@@ -143,7 +155,7 @@ class Evaluations:
             views=None if held_out is None else len(held_out.views),
             validation_psnr=self._validation(),
         )
-        run.curve.append(point)
+        run.state.curve = (*run.state.curve, point)
         self.seconds += time.perf_counter() - started
         return point
 

@@ -1,11 +1,9 @@
-"""Training: takes steps until the budget is spent, evaluates on the way, and rolls back after numerical failures."""
+"""Training: takes steps until the budget is spent, is observed on the way, and rolls back after numerical failures."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 from splatmill_worker.errors import Cancelled, FailureName, TrainingFailed
 from splatmill_worker.splat.engine.open import gaussians_of
@@ -13,10 +11,17 @@ from splatmill_worker.splat.engine.protocol import Engine
 from splatmill_worker.splat.evaluate import Score
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.plan.plan import Plan
-from splatmill_worker.splat.train.curve import CurvePoint, last_gain
+from splatmill_worker.splat.train.curve import CurvePoint
 from splatmill_worker.splat.train.disagreement import Disagreement, Look
 from splatmill_worker.splat.train.evaluations import Evaluations, corrected
-from splatmill_worker.splat.train.poses import Poses, mean_depth
+from splatmill_worker.splat.train.observers import (
+    CHECKPOINT_SECONDS,
+    Checkpoints,
+    Observer,
+    ProgressReports,
+    TrainingProgress,
+)
+from splatmill_worker.splat.train.poses import Poses, scene_depth
 from splatmill_worker.splat.train.renderer import render_view
 from splatmill_worker.splat.train.run import TrainingRun
 from splatmill_worker.splat.train.snapshot import Snapshot
@@ -25,62 +30,18 @@ from splatmill_worker.splat.views import TrainingView
 MAX_RECOVERIES = 3
 """Roll-backs of a run; the next failure ends it."""
 
-PROGRESS_SECONDS = 0.5
-"""Seconds between two reports of progress."""
-
-CHECKPOINT_SECONDS = 20.0
-"""Seconds between two checkpoints, at most."""
-
-FIRST_CHECKPOINT_SECONDS = 2.5
-"""Seconds until the first checkpoint. From there to CHECKPOINT_SECONDS, each is as far from the last as that one is
-from the beginning, so that an attempt which is lost early loses half of its work at most."""
-
-FLAT_TAIL = 0.1
-"""Share of the time spent so far in which the rates fall to their ends once doublings gain too little."""
-
-
-@dataclass(frozen=True)
-class TrainingProgress:
-    """Where a run stands.
-
-    step: training steps so far.
-    steps: steps of the whole run, estimated under a time budget.
-    loss: training loss of the last step.
-    gaussians: how many the scene has.
-    seconds: training time so far.
-    eta: training seconds to come, estimated.
-    """
-
-    step: int
-    steps: int
-    loss: float
-    gaussians: int
-    seconds: float
-    eta: float
-
-
-class Observer(Protocol):
-    """Looks at the scene at moments of its own choice, while the training clock stands still."""
-
-    def is_due(self, progress: float) -> bool:
-        """Whether to look at the scene now, at this share of the budget."""
-
-    def observe(self, engine: Engine, progress: float, seconds: float, step: int) -> None:
-        """Look at what `engine` holds after `step` steps, `seconds` into the training."""
-
 
 @dataclass(frozen=True)
 class Hooks:
     """What training calls while it runs.
 
-    progress: every PROGRESS_SECONDS.
+    progress: now and then (`ProgressReports`).
     evaluated: with every new point of the curve.
     warn: with a sentence, when a numerical failure was rolled back.
     cancelled: before every step; training ends when it returns True.
-    checkpoint: with a snapshot to store, every `checkpoint_seconds`, sooner at first (FIRST_CHECKPOINT_SECONDS), and on
-        a cancellation; None: never.
+    checkpoint: with a snapshot to store, now and then (`Checkpoints`) and on a cancellation; None: never.
     checkpoint_seconds: seconds between two checkpoints, at most.
-    observers: look at the scene, each at moments of its own.
+    observers: others that observe the run.
     """
 
     progress: Callable[[TrainingProgress], None] = lambda _: None
@@ -151,59 +112,55 @@ def train(
     render_view(engine, plan, views[0])  # code is loaded and memory allocated before the clock starts
     poses = None
     if plan.pose_refinement:
-        poses = Poses(views, _scene_depth(engine, views, plan))
+        poses = Poses(views, scene_depth(engine, views, plan))
         engine.keep_pose_gradient = True
     run = TrainingRun(engine, plan, views, extent, poses=poses, warn=hooks.warn)
     if resume_from is not None:
         run.resume(resume_from)
     validation = tuple(run.views[index].name for index in sorted(run.set_aside))
-    evaluations, look = Evaluations(run, held_out), Look(run)
-    stopped, failure = "", None
-    began = last_progress = last_checkpoint = time.monotonic()
-    while not stopped:
-        if run.set_aside and (run.shortened or evaluations.last_is_next):
+    evaluations, look = Evaluations(run, held_out, hooks.evaluated), Look(run)
+    observers: list[Observer] = [evaluations, look, *hooks.observers, ProgressReports(hooks.progress)]
+    if hooks.checkpoint is not None:
+        observers.append(Checkpoints(hooks.checkpoint, hooks.checkpoint_seconds))
+    failure = None
+    while not run.stopped:
+        if run.set_aside and (run.state.shortened or evaluations.last_is_next):
             run.train_on_all()
         if hooks.cancelled():
-            if hooks.checkpoint is not None and run.step > 0:
+            if hooks.checkpoint is not None and run.state.step > 0:
                 hooks.checkpoint(run.snapshot())
             raise Cancelled
-        try:
-            run.advance()
-        except TrainingFailed as failed:
-            if run.recoveries >= MAX_RECOVERIES or failed.name is FailureName.empty_scene:
-                if not run.ever_visible or not run.curve or not run.restore_last_good():
-                    raise
-                stopped, failure = f"{failed}", failed
-                break
-            run.roll_back(failed)
-        if evaluations.due:
-            with run.clock.stopped():
-                hooks.evaluated(evaluations.evaluate(), engine)
-            stopped = _reason_to_stop(run)
-        if look.is_due:
-            with run.clock.stopped():
-                look.take()
-        for observer in hooks.observers:
-            if observer.is_due(run.progress):
+        failure = _advance(run)
+        if failure is not None:
+            break
+        for observer in observers:
+            if observer.is_due(run):
                 with run.clock.stopped():
-                    observer.observe(engine, run.progress, run.clock.seconds, run.step)
-        now = time.monotonic()
-        if now - last_progress >= PROGRESS_SECONDS:
-            last_progress = now
-            hooks.progress(_progress(run))
-        gap = min(hooks.checkpoint_seconds, max(FIRST_CHECKPOINT_SECONDS, last_checkpoint - began))
-        if hooks.checkpoint is not None and not stopped and now - last_checkpoint >= gap:
-            with run.clock.stopped():
-                hooks.checkpoint(run.snapshot())
-            last_checkpoint = time.monotonic()
-    return _result(run, evaluations, look, stopped, failure, validation)
+                    observer.observe(run)
+    return _result(run, evaluations, look, failure, validation)
+
+
+def _advance(run: TrainingRun) -> TrainingFailed | None:
+    """Take one step, or roll back from its failure; returns the failure that the run ends with, in its last good state.
+
+    Raises TrainingFailed where no usable state was reached.
+    """
+    try:
+        run.advance()
+    except TrainingFailed as failed:
+        state = run.state
+        if state.recoveries >= MAX_RECOVERIES or failed.name is FailureName.empty_scene:
+            if not state.ever_visible or not state.curve or not run.restore_last_good():
+                raise
+            return failed
+        run.roll_back(failed)
+    return None
 
 
 def _result(
     run: TrainingRun,
     evaluations: Evaluations,
     look: Look,
-    stopped: str,
     failure: TrainingFailed | None,
     validation: tuple[str, ...],
 ) -> Trained:
@@ -216,61 +173,17 @@ def _result(
     found = look.finish()
     return Trained(
         gaussians=gaussians_of(run.engine).padded(run.plan.schedule.degree),
-        curve=tuple(run.curve),
+        curve=run.state.curve,
         held_out=final.held_out,
         on_training=final.on_training,
-        steps=run.step,
+        steps=run.state.step,
         seconds=seconds,
         evaluate_seconds=evaluations.seconds + look.seconds,
-        stopped=stopped,
+        stopped=run.stopped if failure is None else f"{failure}",
         failure=failure,
-        recoveries=run.recoveries,
+        recoveries=run.state.recoveries,
         views=corrected(run),
         cameras_moved=None if run.poses is None else run.poses.pixels_moved(),
         validation=validation,
         disagreements=found,
     )
-
-
-def _scene_depth(engine: Engine, views: Sequence[TrainingView], plan: Plan) -> float:
-    """Median, over about eight views, of the mean depth that they show before training."""
-    depths = []
-    for view in views[:: max(1, len(views) // 8)]:
-        target = view.full
-        _, alpha, depth = engine.forward(
-            target.viewmat,
-            target.K,
-            target.camera.width,
-            target.camera.height,
-            degree=0,
-            antialias=plan.antialias,
-        )
-        depths.append(mean_depth(depth, alpha))
-    return sorted(depths)[len(depths) // 2]
-
-
-def _reason_to_stop(run: TrainingRun) -> str:
-    """Why the run ends after its last evaluation; empty where it continues. May cut the budget."""
-    plan, gain = run.plan, last_gain(run.curve)
-    if run.progress >= 1.0:
-        why = (
-            f"another doubling of the steps would gain less than {plan.least_gain:g} dB"
-            if run.shortened
-            else "the budget is spent"
-        )
-        if gain is None or not plan.stops_when_flat:
-            return why
-        return f"{why}; the last one gained {gain:.2f} dB on the validation photos"
-    reached = run.curve[-1].validation_psnr
-    if plan.target_psnr is not None and reached is not None and reached >= plan.target_psnr:
-        return f"the validation photos ({len(run.set_aside)}) reached {reached:.2f} dB"
-    if plan.stops_when_flat and not run.shortened and gain is not None and gain < plan.least_gain:
-        run.shorten(FLAT_TAIL)
-    return ""
-
-
-def _progress(run: TrainingRun) -> TrainingProgress:
-    progress, seconds = run.progress, run.clock.seconds
-    total = run.step if progress <= 0 else round(run.step / progress)
-    eta = seconds * (1.0 - progress) / max(progress, 1e-6)
-    return TrainingProgress(run.step, max(run.step, total), run.loss, run.engine.count, seconds, eta)

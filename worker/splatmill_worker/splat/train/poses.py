@@ -9,7 +9,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from splatmill_worker.splat.engine.protocol import Engine
 from splatmill_worker.splat.motion import cross_matrix, motion
+from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.views import Target, TrainingView
 
 REACH = 6.0
@@ -143,3 +145,20 @@ def mean_depth(depth: Tensor, alpha: Tensor) -> float:
     """Mean depth of a rendered view (depth, alpha [H, W]), world units; 1, the cameras' radius, where it is empty."""
     total = float(alpha.sum())
     return float(depth.sum()) / total if total > 0.0 else 1.0
+
+
+def scene_depth(engine: Engine, views: Sequence[TrainingView], plan: Plan) -> float:
+    """Median, over about eight views, of the mean depth that they show before training."""
+    depths = []
+    for view in views[:: max(1, len(views) // 8)]:
+        target = view.full
+        _, alpha, depth = engine.forward(
+            target.viewmat,
+            target.K,
+            target.camera.width,
+            target.camera.height,
+            degree=0,
+            antialias=plan.antialias,
+        )
+        depths.append(mean_depth(depth, alpha))
+    return sorted(depths)[len(depths) // 2]

@@ -15,14 +15,13 @@ from splatmill_worker.splat.engine.protocol import Engine, StepResult
 from splatmill_worker.splat.plan.budget import Clock
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.plan.rates import RateSchedule, boost_of
-from splatmill_worker.splat.train.curve import CurvePoint
 from splatmill_worker.splat.train.density.densify import densify
 from splatmill_worker.splat.train.dropout import dropout
 from splatmill_worker.splat.train.health import LossHealth
 from splatmill_worker.splat.train.pace import Pace
 from splatmill_worker.splat.train.poses import Poses
 from splatmill_worker.splat.train.renderer import fixed_background
-from splatmill_worker.splat.train.snapshot import Snapshot
+from splatmill_worker.splat.train.snapshot import RunState, Snapshot
 from splatmill_worker.splat.train.validation import validation_indices
 from splatmill_worker.splat.views import TrainingView
 
@@ -37,7 +36,7 @@ STREAM = 1_000_003
 
 
 class TrainingRun:
-    """Everything that changes while training.
+    """A scene in training: the engine that holds it, and what the run has reached.
 
     engine: the scene, its optimiser and the kernels.
     plan: what was decided before training.
@@ -46,20 +45,13 @@ class TrainingRun:
     extent: radius of the cameras in the training world, the unit of the position rate.
     poses: corrections of the cameras; None where they are taken as given.
     warn: gets a sentence at each roll-back.
-    budget: what the run may spend; cut where the curve becomes flat.
+    state: what the run has reached.
     clock: training seconds.
-    step: training steps so far.
     loss: training loss of the last step; NaN before the first.
-    curve: the evaluations so far, appended by the loop.
-    recoveries: roll-backs so far.
-    rate_scale: factor on all learning rates.
-    max_gaussians: most Gaussians that there may be.
     reduction: factor by which the photos of the last step were reduced; 0 before the first.
-    upcoming: indices of the photos still to come in this round, the next one last.
     health: judges the loss.
     pace: seconds per step.
-    shortened: whether the budget was cut.
-    ever_visible: whether any photo has shown a Gaussian.
+    stopped: why the run has ended, a clause; empty while it goes on.
     last_good: the snapshot to roll back to; None before the first.
     """
 
@@ -76,27 +68,20 @@ class TrainingRun:
         self.engine, self.plan, self.views, self.extent = engine, plan, views, extent
         self.set_aside = frozenset(validation_indices(len(views), plan.validation or 0))
         self.poses, self.warn = poses, warn
-        self.budget = plan.schedule.budget
+        self.state = RunState(plan.schedule.budget, plan.max_gaussians)
         self.clock = Clock()
-        self.step = 0
         self.loss = math.nan
-        self.curve: list[CurvePoint] = []
-        self.recoveries = 0
-        self.rate_scale = 1.0
-        self.max_gaussians = plan.max_gaussians
         self.reduction = 0
-        self.upcoming: list[int] = []
         self.health = LossHealth()
         self.pace = Pace(plan.schedule.expected_steps)
-        self.shortened = False
-        self.ever_visible = False
+        self.stopped = ""
         self.last_good: Snapshot | None = None
         self._random = torch.Generator().manual_seed(plan.seed)
 
     @property
     def progress(self) -> float:
         """Share of the budget that is spent, 0 to 1."""
-        return self.budget.progress(self.step, self.clock.seconds)
+        return self.state.budget.progress(self.state.step, self.clock.seconds)
 
     def advance(self) -> None:
         """Take one step, and densify where the schedule says so. Raises TrainingFailed for a numerical failure."""
@@ -106,13 +91,13 @@ class TrainingRun:
             progress - self.last_good.progress >= SNAPSHOT_SHARE and self.health.near_lowest
         ):
             self.last_good = self._checked_snapshot()
-        self.step += 1
-        reduction = schedule.reduction(self.step)
+        self.state.step += 1
+        reduction = schedule.reduction(self.state.step)
         if reduction != self.reduction:
             self.reduction = reduction
             for view in self.views:
                 view.forget_reduced()  # coarse photos do not come again
-            self.health.expect_rise(self.step)
+            self.health.expect_rise(self.state.step)
         index = self._next_view()
         rates = self.rates(progress)
         began = self.clock.seconds
@@ -121,26 +106,26 @@ class TrainingRun:
         if reduction == 1:
             self.pace.record(self.clock.seconds - began)
         if self.poses is not None and self.engine.pose_gradient is not None:
-            self.poses.update(index, self.engine.pose_gradient, progress, self.rate_scale)
-        self.ever_visible |= result.visible > 0
-        self.health.check(self.step, result.loss, result.visible)
+            self.poses.update(index, self.engine.pose_gradient, progress, self.state.rate_scale)
+        self.state.ever_visible |= result.visible > 0
+        self.health.check(self.state.step, result.loss, result.visible)
         # Scores cost time, so they are summed only while densification goes on.
         self.engine.keep_scores = self.plan.densify and progress < schedule.densify_until
-        if self.plan.densify and schedule.densifies(self.step, progress):
+        if self.plan.densify and schedule.densifies(self.state.step, progress):
             self._densify()
 
     def rates(self, progress: float) -> Rates:
         """Learning rates at `progress`, 0 to 1. Under a time budget they are scaled to the measured number of steps."""
         annealing = self.plan.schedule.annealing
         if annealing.boost is None:
-            steps = self.pace.steps(self.budget, self.step, self.clock.seconds)
+            steps = self.pace.steps(self.state.budget, self.state.step, self.clock.seconds)
             annealing = replace(annealing, boost=boost_of(steps))
-        return RateSchedule(self.extent, annealing, self.rate_scale).at(progress)
+        return RateSchedule(self.extent, annealing, self.state.rate_scale).at(progress)
 
     def shorten(self, tail: float) -> None:
         """End after another `tail` of what was spent so far: rates fall to their ends in that time."""
-        self.budget = self.budget.ending_at(self.progress, tail)
-        self.shortened = True
+        self.state.budget = self.state.budget.ending_at(self.progress, tail)
+        self.state.shortened = True
 
     def train_on_all(self) -> None:
         """Take steps on the photos that were set aside too: no decision is made by them any more."""
@@ -152,16 +137,18 @@ class TrainingRun:
         """
         if self.last_good is None:
             raise failure
-        self.recoveries += 1
+        self.state.recoveries += 1
         if failure.name is FailureName.memory:
-            self.max_gaussians = max(1, int(MEMORY_SHRINK * self.engine.count))
-            self.last_good = self.last_good.most_opaque(self.max_gaussians)
-            measure = f"with at most {self.max_gaussians} Gaussians"
+            self.state.max_gaussians = max(1, int(MEMORY_SHRINK * self.engine.count))
+            self.last_good = self.last_good.most_opaque(self.state.max_gaussians)
+            measure = f"with at most {self.state.max_gaussians} Gaussians"
         else:
-            self.rate_scale *= 0.5
+            self.state.rate_scale *= 0.5
             measure = "with half the learning rates"
         self._restore(self.last_good)
-        self.health = LossHealth(lowest=self.last_good.lowest_loss, checked_from=self.step + len(self.views))
+        self.health = LossHealth(
+            lowest=self.last_good.lowest_loss, checked_from=self.state.step + len(self.views)
+        )
         self.warn(f"{failure} Training went back to the last good state and goes on {measure}.")
 
     def restore_last_good(self) -> bool:
@@ -179,17 +166,9 @@ class TrainingRun:
             exp_avg=exp_avg,
             exp_avg_sq=exp_avg_sq,
             poses=None if self.poses is None else self.poses.state(),
-            step=self.step,
+            state=replace(self.state),
             seconds=self.clock.seconds,
-            budget=self.budget,
-            shortened=self.shortened,
-            curve=tuple(self.curve),
-            recoveries=self.recoveries,
-            rate_scale=self.rate_scale,
-            max_gaussians=self.max_gaussians,
-            upcoming=tuple(self.upcoming),
             random=self._random.get_state(),
-            ever_visible=self.ever_visible,
             view_names=tuple(view.name for view in self.views),
             lowest_loss=self.health.lowest,
         )
@@ -197,18 +176,10 @@ class TrainingRun:
     def resume(self, snapshot: Snapshot) -> None:
         """Go on from `snapshot`. Densification scores, the pace and the health of the loss start anew."""
         self._restore(snapshot)
-        self.step = snapshot.step
+        self.state = replace(snapshot.state)
         self.clock = Clock(snapshot.seconds)
-        self.budget = snapshot.budget
-        self.shortened = snapshot.shortened
-        self.curve = list(snapshot.curve)
-        self.recoveries = snapshot.recoveries
-        self.rate_scale = snapshot.rate_scale
-        self.max_gaussians = snapshot.max_gaussians
-        self.upcoming = list(snapshot.upcoming)
         self._random.set_state(snapshot.random)
-        self.ever_visible = snapshot.ever_visible
-        self.health.expect_rise(self.step)
+        self.health.expect_rise(self.state.step)
 
     def _restore(self, snapshot: Snapshot) -> None:
         """Put back what was optimised: Gaussians, moments and cameras."""
@@ -221,23 +192,25 @@ class TrainingRun:
         snapshot = self.snapshot()
         bad = sum(int((~torch.isfinite(value)).sum()) for value in snapshot.parameters.values())
         if bad:
-            raise TrainingFailed(FailureName.non_finite, f"{bad} parameters are not finite.", step=self.step)
+            raise TrainingFailed(
+                FailureName.non_finite, f"{bad} parameters are not finite.", step=self.state.step
+            )
         return snapshot
 
     def _step(self, index: int, rates: Rates) -> StepResult:
         """One optimisation step on photo number `index`, at the reduction of this step."""
         target = self.views[index].reduced(self.reduction)
         background = self._background()
-        share = self.plan.schedule.left_out(self.step / max(1, len(self.views) - len(self.set_aside)))
+        share = self.plan.schedule.left_out(self.state.step / max(1, len(self.views) - len(self.set_aside)))
         try:
-            with dropout(self.engine.logit_opacities, share, seed=self.plan.seed * STREAM + self.step):
+            with dropout(self.engine.logit_opacities, share, seed=self.plan.seed * STREAM + self.state.step):
                 return self.engine.train_photo(
                     target.viewmat if self.poses is None else self.poses.viewmat(index),
                     target.K,
                     target.rgb,
                     degree=self.plan.schedule.degree,
                     rates=rates,
-                    step=self.step,
+                    step=self.state.step,
                     background=background,
                     alpha=target.alpha,
                     mask=target.mask,
@@ -245,7 +218,7 @@ class TrainingRun:
                     key=(index, self.reduction),
                 )
         except MemoryError as short:
-            raise TrainingFailed(FailureName.memory, f"{short}", step=self.step) from short
+            raise TrainingFailed(FailureName.memory, f"{short}", step=self.state.step) from short
 
     def _background(self) -> Tensor:
         """RGB [3] behind this step's photo. A random one keeps training from hiding holes in the surface."""
@@ -255,13 +228,16 @@ class TrainingRun:
 
     def _next_view(self) -> int:
         """The index of the next photo: all that are not set aside once in random order, then all of them again."""
-        if not self.upcoming:
+        state = self.state
+        if not state.upcoming:
             order = torch.randperm(len(self.views), generator=self._random).tolist()
-            self.upcoming = [index for index in order if index not in self.set_aside]
-        return self.upcoming.pop()
+            state.upcoming = tuple(index for index in order if index not in self.set_aside)
+        *rest, index = state.upcoming
+        state.upcoming = tuple(rest)
+        return index
 
     def _densify(self) -> None:
-        allowed = min(self.plan.max_gaussians, self.max_gaussians)
+        allowed = min(self.plan.max_gaussians, self.state.max_gaussians)
         if self.plan.max_memory is not None:
             allowed = min(allowed, self.plan.gaussians_within(self.plan.max_memory))
         within = self.plan.schedule.decay_within
@@ -273,7 +249,7 @@ class TrainingRun:
                 decay_within=math.inf if within is None else within,
             )
         except MemoryError as short:
-            raise TrainingFailed(FailureName.memory, f"{short}", step=self.step) from short
+            raise TrainingFailed(FailureName.memory, f"{short}", step=self.state.step) from short
         if self.engine.count == 0:
             seen = "every Gaussian became transparent and was removed."
-            raise TrainingFailed(FailureName.empty_scene, seen, step=self.step)
+            raise TrainingFailed(FailureName.empty_scene, seen, step=self.state.step)
