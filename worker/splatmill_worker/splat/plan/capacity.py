@@ -10,7 +10,7 @@ from splatmill_worker.kernels.gpu.device import largest_budget
 from splatmill_worker.splat.plan.budget import Budget
 from splatmill_worker.splat.plan.facts import Facts, Speed
 from splatmill_worker.splat.plan.plan import Kernels, Plan
-from splatmill_worker.splat.plan.reasons import Reasons
+from splatmill_worker.splat.plan.reasons import Decision, by_option, switch
 
 PIXELS_PER_GAUSSIAN = 50
 """Pixels of all training photos for each Gaussian that they resolve (decisions: PIXELS_PER_GAUSSIAN)."""
@@ -22,47 +22,37 @@ ASSUMED_SPEED = Speed(per_pixel=3e-8, per_gaussian=1e-7)
 class Capacity(NamedTuple):
     """The size of a run.
 
+    max_gaussians: the largest number of Gaussians.
     budget: its limits in steps and seconds.
     steps: the number of steps that the budget is expected to allow.
-    max_gaussians: the largest number of Gaussians.
     """
 
-    budget: Budget
-    steps: int
-    max_gaussians: int
+    max_gaussians: Decision[int]
+    budget: Decision[Budget]
+    steps: Decision[int]
 
 
 def decide_capacity(
-    facts: Facts,
-    options: TrainOptions,
-    kernels: Kernels,
-    reasons: Reasons,
-    *,
-    initial: int,
-    pixels: float,
+    facts: Facts, options: TrainOptions, kernels: Kernels, *, initial: int, pixels: float
 ) -> Capacity:
-    """The budget of a run, and the largest number of Gaussians that it may train.
+    """The largest number of Gaussians that a run may train, and its budget.
 
     initial: number of Gaussians before the first step.
     pixels: number of pixels of a photo at the training size.
     """
-    most = _max_gaussians(facts, options, kernels, pixels, initial, reasons)
+    most = _max_gaussians(facts, options, kernels, pixels, initial)
     # Charged as midway, in the logarithm, between the first Gaussians and the most (decisions: forecast).
-    step = (facts.speed or ASSUMED_SPEED).step(pixels, math.sqrt(max(1, min(initial, most)) * most))
-    budget, steps = _budget(facts, options, step, reasons)
-    return Capacity(budget, steps, most)
+    midway = math.sqrt(max(1, min(initial, most.value)) * most.value)
+    return Capacity(most, *_budget(facts, options, (facts.speed or ASSUMED_SPEED).step(pixels, midway)))
 
 
-def decide_densification(
-    options: TrainOptions, capacity: Capacity, reasons: Reasons, *, initial: int
-) -> bool:
-    """Whether Gaussians are added in training."""
-    most = capacity.max_gaussians
+def decide_densification(options: TrainOptions, most: int, *, initial: int) -> Decision[bool]:
+    """Whether Gaussians are added in training, of which there may be `most`."""
     if initial >= most:
         because = f"Training starts with {initial} Gaussians, as many as are allowed."
     else:
         because = f"Training starts with {initial} Gaussians, and {most} are allowed."
-    return reasons.switch("densify", options.densify, initial < most, because)
+    return switch(options.densify, Decision(initial < most, because))
 
 
 def resolved(pixels: float, views: int) -> int:
@@ -71,8 +61,8 @@ def resolved(pixels: float, views: int) -> int:
 
 
 def _max_gaussians(
-    facts: Facts, options: TrainOptions, kernels: Kernels, pixels: float, initial: int, reasons: Reasons
-) -> int:
+    facts: Facts, options: TrainOptions, kernels: Kernels, pixels: float, initial: int
+) -> Decision[int]:
     """The largest number of Gaussians: training adds them only where the photos ask for more detail, so that a limit is
     all that a plan needs (decisions: PIXELS_PER_GAUSSIAN).
     """
@@ -84,52 +74,43 @@ def _max_gaussians(
         by_memory = Plan.gaussians_within(options.max_memory or facts.memory_available // 2)
     most = min(max(by_photos, initial), by_memory)
     if options.max_gaussians is not None and options.max_gaussians <= most:
-        reasons.option("max_gaussians")
-        return options.max_gaussians
+        return by_option(options.max_gaussians)
     because = {
         by_photos: f"{facts.views} photos of {round(pixels)} pixels resolve {by_photos} Gaussians. Training makes as "
         "many of them as the detail of the scene asks for.",
         by_memory: f"Memory holds {by_memory} Gaussians.",
     }
-    reasons.chosen["max_gaussians"] = because.get(
-        most, f"Training starts with {initial} Gaussians, more than the photos resolve."
+    return Decision(
+        most, because.get(most, f"Training starts with {initial} Gaussians, more than the photos resolve.")
     )
-    return most
 
 
-def _budget(facts: Facts, options: TrainOptions, step: float, reasons: Reasons) -> tuple[Budget, int]:
+def _budget(facts: Facts, options: TrainOptions, step: float) -> tuple[Decision[Budget], Decision[int]]:
     """The budget, and the number of steps that it is expected to allow, at `step` seconds each."""
     if options.time_budget is not None:
-        return _time_budget(facts, options, options.time_budget, step, reasons)
+        return _time_budget(facts, options, options.time_budget, step)
     if options.steps is not None:
-        reasons.option("budget")
-        reasons.chosen["schedule"] = f"The option steps asks for {options.steps} steps."
-        return Budget(options.steps), options.steps
+        because = f"The option steps asks for {options.steps} steps."
+        return by_option(Budget(options.steps)), Decision(options.steps, because)
     steps = preset_steps(options.ending, facts.views)
-    reasons.chosen["budget"] = (
-        f"No budget was given; for {facts.views} photos, the preset {options.ending.value} allows {steps} steps."
-    )
-    reasons.chosen["schedule"] = (
-        f"{steps} steps take about {format_duration(steps * step)} on this machine, at most."
-    )
-    return Budget(steps), steps
+    given = f"No budget was given; for {facts.views} photos, the preset {options.ending.value} allows {steps} steps."
+    takes = f"{steps} steps take about {format_duration(steps * step)} on this machine, at most."
+    return Decision(Budget(steps), given), Decision(steps, takes)
 
 
 def _time_budget(
-    facts: Facts, options: TrainOptions, seconds: float, step: float, reasons: Reasons
-) -> tuple[Budget, int]:
+    facts: Facts, options: TrainOptions, seconds: float, step: float
+) -> tuple[Decision[Budget], Decision[int]]:
     affordable = max(1, int(seconds / step))
     steps = affordable if options.steps is None else min(affordable, options.steps)
-    reasons.option("budget")
-    reasons.chosen["schedule"] = (
-        f"{seconds:g} s at {1e3 * step:.1f} ms a step allow about {affordable} steps"
-        + ("." if steps == affordable else f", of which the option steps asks for {steps}.")
+    because = f"{seconds:g} s at {1e3 * step:.1f} ms a step allow about {affordable} steps" + (
+        "." if steps == affordable else f", of which the option steps asks for {steps}."
     )
     few = PRESET_VISITS[Preset.draft]
     if steps < few * facts.views:
         needed = format_duration(few * facts.views * step)
-        reasons.chosen["schedule"] += (
+        because += (
             f" They show each of {facts.views} photos {steps / facts.views:.1f} times. Up to about {few} times, every "
             f"doubling makes the pictures clearly sharper; that would take {needed}."
         )
-    return Budget(options.steps, seconds), steps
+    return by_option(Budget(options.steps, seconds)), Decision(steps, because)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from splatmill.schema import Switch, TrainOptions
 from splatmill_worker.splat.plan.facts import Facts
 from splatmill_worker.splat.plan.plan import Kernels
-from splatmill_worker.splat.plan.reasons import Reasons
+from splatmill_worker.splat.plan.reasons import Decision, switch
 
 MUCH_SKY = 0.05
 """Share of the photos' area from which sky counts: a smaller one may be a window or a white wall."""
@@ -37,32 +37,33 @@ class Needs(NamedTuple):
     added: number of Gaussians that the far shell and the gaps add before the first step.
     """
 
-    far_shell: bool
-    gaps: bool
-    pose_refinement: bool
+    far_shell: Decision[bool]
+    gaps: Decision[bool]
+    pose_refinement: Decision[bool]
     added: int
 
 
-def needs_of(
-    facts: Facts, options: TrainOptions, kernels: Kernels, reasons: Reasons, *, scale: float = 1.0
-) -> Needs:
-    """The parts that the facts call for or the options force, each explained in `reasons`.
+def needs_of(facts: Facts, options: TrainOptions, kernels: Kernels, *, scale: float = 1.0) -> Needs:
+    """The parts that the facts call for or the options force.
 
     scale: size of the photos in training over their size as they were loaded.
 
     Raises ValueError, as a sentence, for an option that cannot be followed with this scene or these kernels.
     """
     _check_seeds(facts, options)
-    far_shell = reasons.switch("far_shell", options.far_shell, *_far_shell(facts))
-    gaps = reasons.switch("gaps", options.gaps, *_gaps(facts))
-    poses = reasons.switch("pose_refinement", options.pose_refinement, *_poses(facts, kernels, scale))
-    if poses:
+    far_shell = switch(options.far_shell, _far_shell(facts))
+    gaps = switch(options.gaps, _gaps(facts))
+    poses = switch(options.pose_refinement, _poses(facts, kernels, scale))
+    if poses.value:
         _check_poses(facts, kernels)
-        reasons.chosen["pose_refinement"] += (
-            " Held-out cameras are not corrected: fitting them to their photos would flatter the score."
+        poses = poses._replace(
+            reason=f"{poses.reason} Held-out cameras are not corrected: fitting them to their photos would flatter the "
+            "score."
         )
     covered = facts.coverage
-    added = 0 if covered is None else far_shell * covered.shell_points + gaps * covered.gap_points
+    added = (
+        0 if covered is None else (far_shell.value * covered.shell_points + gaps.value * covered.gap_points)
+    )
     return Needs(far_shell, gaps, poses, added)
 
 
@@ -102,66 +103,71 @@ def _check_poses(facts: Facts, kernels: Kernels) -> None:
         )
 
 
-def _far_shell(facts: Facts) -> tuple[bool, str]:
+def _far_shell(facts: Facts) -> Decision[bool]:
     if facts.start is not None:
-        return False, "The given model is kept as it is."
+        return Decision(False, "The given model is kept as it is.")
     if facts.transparent:
-        return False, f"{facts.transparent} photos are transparent, so nothing stands behind the scene."
+        return Decision(
+            False, f"{facts.transparent} photos are transparent, so nothing stands behind the scene."
+        )
     if facts.coverage is None:
-        return False, "There are too few points to tell how far the scene extends."
+        return Decision(False, "There are too few points to tell how far the scene extends.")
     seen = f"{100 * facts.coverage.sky_share:.0f} % of the photos look like sky"
     to_one_side = facts.alignment is None or facts.alignment > HALF_TURN
     if facts.views < FEW_VIEWS and facts.coverage.sky_share < MUCH_SKY and to_one_side:
-        return (
+        return Decision(
             False,
             f"{seen}, and {facts.views} photos to one side are too few to tell whether anything else is as far away.",
         )
-    return (
+    return Decision(
         True,
         f"{facts.coverage.shell_points} Gaussians stand on a far shell behind the scene, for what shows through its "
         f"holes and for sky; {seen}.",
     )
 
 
-def _gaps(facts: Facts) -> tuple[bool, str]:
+def _gaps(facts: Facts) -> Decision[bool]:
     if facts.start is not None:
-        return False, "The given model is kept as it is."
+        return Decision(False, "The given model is kept as it is.")
     if facts.coverage is None:
         if facts.transparent:
-            return (
+            return Decision(
                 False,
                 f"{facts.transparent} photos are transparent, so a place without points may be empty.",
             )
-        return False, "There are too few points to tell where points are missing."
+        return Decision(False, "There are too few points to tell where points are missing.")
     covered = facts.coverage
     seen = (
         f"{100 * covered.gap_share:.0f} % of what the photos show has no point near it "
         f"(median of {covered.sightings:.0f} points per photo)"
     )
     if covered.gap_share < MANY_GAPS:
-        return False, f"Only {seen}."
+        return Decision(False, f"Only {seen}.")
     if facts.views < FEW_VIEWS:
-        return False, f"{seen}, but {facts.views} photos are too few to correct guessed depths."
+        return Decision(False, f"{seen}, but {facts.views} photos are too few to correct guessed depths.")
     if facts.alignment is not None and facts.alignment <= HALF_TURN:
-        return False, (
+        return Decision(
+            False,
             f"{seen}, but the photos look over more than half a turn, so that those of one side would look through "
-            "what is guessed from the other."
+            "what is guessed from the other.",
         )
-    return (
+    return Decision(
         True,
         f"{seen}: {covered.gap_points} Gaussians are added there, at the depth of the nearest points.",
     )
 
 
-def _poses(facts: Facts, kernels: Kernels, scale: float) -> tuple[bool, str]:
+def _poses(facts: Facts, kernels: Kernels, scale: float) -> Decision[bool]:
     if facts.reprojection is None:
-        return False, "Without reprojection errors of points, the cameras are taken to be exact."
+        return Decision(False, "Without reprojection errors of points, the cameras are taken to be exact.")
     error = scale * facts.reprojection
     if facts.views < 2:
-        return False, "A model of one photo fits any camera."
+        return Decision(False, "A model of one photo fits any camera.")
     seen = f"The median reprojection error is {error:.2f} pixels"
     if error < MIN_POSE_ERROR:
-        return False, f"{seen}; cameras are corrected from {MIN_POSE_ERROR:g} pixel."
+        return Decision(False, f"{seen}; cameras are corrected from {MIN_POSE_ERROR:g} pixel.")
     if kernels == "gpu":
-        return False, f"{seen}, which calls for correcting the cameras, but the gpu kernels cannot do so."
-    return True, f"{seen}, so the cameras of training photos are corrected."
+        return Decision(
+            False, f"{seen}, which calls for correcting the cameras, but the gpu kernels cannot do so."
+        )
+    return Decision(True, f"{seen}, so the cameras of training photos are corrected.")

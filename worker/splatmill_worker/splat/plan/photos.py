@@ -8,7 +8,7 @@ from splatmill.schema import PRESET_GAIN, Background, Preset, Switch, TrainOptio
 from splatmill_worker.splat.plan.facts import Facts
 from splatmill_worker.splat.plan.needs import FEW_VIEWS
 from splatmill_worker.splat.plan.plan import Kernels
-from splatmill_worker.splat.plan.reasons import Reasons
+from splatmill_worker.splat.plan.reasons import Decision, by_option, switch
 
 PRESET_SIZE: dict[Kernels, dict[Preset, int]] = {
     "reference": {Preset.draft: 64, Preset.balanced: 64, Preset.quality: 128},
@@ -50,65 +50,59 @@ def loading_size(options: TrainOptions, kernels: Kernels) -> int:
     return options.image_size or PRESET_SIZE[kernels][options.preset]
 
 
-def decide_image_size(facts: Facts, options: TrainOptions, reasons: Reasons) -> int:
+def decide_image_size(facts: Facts, options: TrainOptions) -> Decision[int]:
     """Longest side of the photos in training, in pixels: that of the loaded photos, or half of it."""
     longest = max(facts.width, facts.height)
     if options.image_size is not None:
-        reasons.option("image_size")
-        return longest
+        return by_option(longest)
     if longest < HALVED_FROM:
-        reasons.chosen["image_size"] = f"Photos of {longest} pixels are too small to be halved."
-        return longest
+        return Decision(longest, f"Photos of {longest} pixels are too small to be halved.")
     if facts.halving_loss < BLURRED:
         half = (longest + 1) // 2
-        reasons.chosen["image_size"] = (
+        return Decision(
+            half,
             f"Halving the photos changes them by only {facts.halving_loss:.1f} of 255 grey levels, so they are "
-            f"trained at {half} pixels."
+            f"trained at {half} pixels.",
         )
-        return half
     allowed = (
         f"the full size of {longest} pixels"
         if facts.native_longest <= longest
         else f"{longest} of {facts.native_longest} pixels, as the preset allows"
     )
-    reasons.chosen["image_size"] = (
-        f"Halving the photos would lose {facts.halving_loss:.1f} of 255 grey levels, so they are trained at {allowed}."
+    return Decision(
+        longest,
+        f"Halving the photos would lose {facts.halving_loss:.1f} of 255 grey levels, so they are trained at {allowed}.",
     )
-    return longest
 
 
-def decide_background(
-    facts: Facts, options: TrainOptions, reasons: Reasons
-) -> Literal["black", "white", "random"]:
+def decide_background(facts: Facts, options: TrainOptions) -> Decision[Literal["black", "white", "random"]]:
     """The colour behind Gaussians and transparent photos (decisions: random-background)."""
     if options.background is not Background.auto:
-        reasons.option("background")
         named: dict[Background, Literal["black", "white", "random"]] = {
             Background.black: "black",
             Background.white: "white",
             Background.random: "random",
         }
-        return named[options.background]
+        return by_option(named[options.background])
     if facts.transparent:
-        reasons.chosen["background"] = (
+        return Decision(
+            "random",
             f"{facts.transparent} photos have transparent parts; over a random background, the model has to leave "
-            "the same parts transparent."
+            "the same parts transparent.",
         )
-        return "random"
-    reasons.left_out["alpha"] = "No photo is transparent."
     if facts.views < FEW_VIEWS:
-        reasons.chosen["background"] = (
+        return Decision(
+            "black",
             f"No photo is transparent. With only {facts.views} photos, a random background would make surfaces opaque "
-            "at wrong depths."
+            "at wrong depths.",
         )
-        return "black"
-    reasons.chosen["background"] = (
-        "No photo is transparent; a random background keeps training from hiding holes in the surface."
+    return Decision(
+        "random",
+        "No photo is transparent; a random background keeps training from hiding holes in the surface.",
     )
-    return "random"
 
 
-def decide_exposure(facts: Facts, options: TrainOptions, reasons: Reasons) -> bool:
+def decide_exposure(facts: Facts, options: TrainOptions) -> Decision[bool]:
     """Whether training photos are brought to the exposure and white balance that the photos around them predict.
 
     Raises ValueError where an option asks for it and the light of the photos cannot be compared.
@@ -118,52 +112,57 @@ def decide_exposure(facts: Facts, options: TrainOptions, reasons: Reasons) -> bo
             "exposure=on needs points that several photos show, since their colours tell how the light differs, and "
             "this scene has too few. Set exposure to auto."
         )
-    return reasons.switch("exposure", options.exposure, *_exposure(facts))
+    return switch(options.exposure, _exposure(facts))
 
 
-def _exposure(facts: Facts) -> tuple[bool, str]:
+def _exposure(facts: Facts) -> Decision[bool]:
     if facts.light is None:
-        return (
+        return Decision(
             False,
             "The photos' exposures cannot be compared: it is not known which photos show the same points.",
         )
     tail, error = facts.light.tail, facts.light.error
     seen = f"One photo in ten departs by {100 * tail:.1f} % or more from the light of the photos around it"
     if not tail >= LIGHT_DEPARTS:
-        return False, f"{seen}; exposures are corrected from {100 * LIGHT_DEPARTS:.1f} %."
+        return Decision(False, f"{seen}; exposures are corrected from {100 * LIGHT_DEPARTS:.1f} %.")
     if not tail >= CERTAIN * error:
-        return False, f"{seen}, which an error of {100 * error:.1f} % of their exposures may explain."
-    if facts.light.unseen > LIGHT_UNSEEN:
-        return False, (
-            f"{seen}, but the photos are too far apart to tell a change of exposure from light that changes with the "
-            "direction of view."
+        return Decision(
+            False, f"{seen}, which an error of {100 * error:.1f} % of their exposures may explain."
         )
-    return True, f"{seen}, so exposure and white balance of the training photos are corrected."
+    if facts.light.unseen > LIGHT_UNSEEN:
+        return Decision(
+            False,
+            f"{seen}, but the photos are too far apart to tell a change of exposure from light that changes with the "
+            "direction of view.",
+        )
+    return Decision(True, f"{seen}, so exposure and white balance of the training photos are corrected.")
 
 
-def decide_antialias(facts: Facts, options: TrainOptions, reasons: Reasons) -> bool:
+def decide_antialias(facts: Facts, options: TrainOptions) -> Decision[bool]:
     """Whether opacities are compensated for the 0.3 pixels by which projection widens every Gaussian."""
-    return reasons.switch("antialias", options.antialias, *_antialias(facts))
+    return switch(options.antialias, _antialias(facts))
 
 
-def _antialias(facts: Facts) -> tuple[bool, str]:
+def _antialias(facts: Facts) -> Decision[bool]:
     if facts.start is not None and facts.start.antialiased is not None:
-        return facts.start.antialiased, "The file of the given model says how the model is drawn."
+        return Decision(facts.start.antialiased, "The file of the given model says how the model is drawn.")
     if facts.geometry is None:
-        return False, "The distances from which points are seen are not known."
+        return Decision(False, "The distances from which points are seen are not known.")
     ratio = facts.geometry.distance_ratio
     if ratio > DISTANCES_DIFFER:
-        return True, (
+        return Decision(
+            True,
             f"One point in ten is seen from distances that differ by a factor of {ratio:.1f} or more, so Gaussians are "
-            "anti-aliased."
+            "anti-aliased.",
         )
-    return False, (
+    return Decision(
+        False,
         f"Nine points in ten are seen from distances that differ by a factor of {ratio:.1f} at most; anti-aliasing is "
-        f"used above {DISTANCES_DIFFER:.0f}."
+        f"used above {DISTANCES_DIFFER:.0f}.",
     )
 
 
-def decide_validation(facts: Facts, options: TrainOptions, reasons: Reasons) -> int | None:
+def decide_validation(facts: Facts, options: TrainOptions) -> Decision[int | None]:
     """Number of training photos that are set aside for decisions made while training; None where none is needed.
 
     Held-out photos are for the report alone: a run that stopped by them would be judged by photos that it was chosen
@@ -179,35 +178,29 @@ def decide_validation(facts: Facts, options: TrainOptions, reasons: Reasons) -> 
         count = max(1, count)
         what = f"the training ends when their mean PSNR reaches {options.target_psnr:g} dB"
     elif options.steps is not None or options.time_budget is not None:
-        reasons.left_out["validation"] = (
-            f"The budget alone ends the training, so that no decision needs any of the {facts.views} photos."
+        return Decision(
+            None,
+            f"The budget alone ends the training, so that no decision needs any of the {facts.views} photos.",
         )
-        return None
     elif count == 0:
-        reasons.left_out["validation"] = (
+        return Decision(
+            None,
             f"{facts.views} photos are too few to set one aside, which is done from {PHOTOS_PER_VALIDATION} photos on, "
-            "so the training does not end before its budget."
+            "so the training does not end before its budget.",
         )
-        return None
     else:
         what = (
             f"the training ends when the last doubling of the steps has raised their mean PSNR by less than "
             f"{PRESET_GAIN[options.ending]:g} dB"
         )
-    reasons.chosen["validation"] = (
-        f"{count} of {facts.views} training photos are set aside until the last decision: {what}."
+    return Decision(
+        count, f"{count} of {facts.views} training photos are set aside until the last decision: {what}."
     )
-    return count
 
 
-def explain_undistortion(facts: Facts, reasons: Reasons) -> None:
-    """Say what loading did about lens distortion, and whether there are masks."""
-    if facts.distorted:
-        by = "" if facts.lens_residual is None else f", by up to {facts.lens_residual:.1f} pixels"
-        reasons.chosen["undistortion"] = (
-            f"The lens distorts {facts.distorted} photos{by}, so they are undistorted."
-        )
-    else:
-        reasons.left_out["undistortion"] = "No photo has lens distortion."
-    if not facts.masked:
-        reasons.left_out["masks"] = "No photo has masked pixels."
+def undistortion(facts: Facts) -> Decision[bool]:
+    """Whether loading the photos removed lens distortion."""
+    if not facts.distorted:
+        return Decision(False, "No photo has lens distortion.")
+    by = "" if facts.lens_residual is None else f", by up to {facts.lens_residual:.1f} pixels"
+    return Decision(True, f"The lens distorts {facts.distorted} photos{by}, so they are undistorted.")
