@@ -125,7 +125,8 @@ def test_the_snapshots_after_a_checkpoint_are_taken_again(tmp_path: Path) -> Non
         lapse.observe(seen(Holder(), step / 100, 1.0, step))
     again = TimeLapse(tmp_path, WORLD, anew=False)
     again.observe(seen(Holder(5), 0.2, 1.0, 20))
-    rows = again.publish(tmp_path / "out") if (tmp_path / "out").mkdir() is None else []
+    (tmp_path / "out").mkdir()
+    rows = again.publish(tmp_path / "out")
     assert [(row["step"], row["gaussians"]) for row in rows] == [(10, 10), (20, 5)]
     assert sorted(path.name for path in (tmp_path / "out" / "time_lapse").iterdir()) == ["000.ply", "001.ply"]
     position = compressed_ply.read(tmp_path / "out" / "time_lapse" / "000.ply").gaussians.means[0].numpy()

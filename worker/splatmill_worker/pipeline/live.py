@@ -113,9 +113,7 @@ class LiveScene:
     """
 
     def __init__(self, looks: Looks, world: ExportWorld, antialiased: bool) -> None:
-        self._looks, self._antialiased = looks, antialiased
-        self._scale = 1.0 / world.normalization.scale
-        self._shift = torch.from_numpy(-self._scale * world.normalization.translation - world.offset)
+        self._looks, self._world, self._antialiased = looks, world, antialiased
 
     def is_due(self, run: TrainingRun) -> bool:
         """Whether to show the scene now."""
@@ -125,7 +123,7 @@ class LiveScene:
         """Show the scene as it is."""
         with self._looks.one():
             scene = gaussians_of(run.engine)
-            shown = most_covering(scene.padded(0), MOST_GAUSSIANS).moved(self._scale, self._shift)
+            shown = self._world.gaussians(most_covering(scene.padded(0), MOST_GAUSSIANS))
             ply = compressed_ply.encode(shown, antialiased=self._antialiased)
             event = SnapshotEvent(
                 step=run.state.step,

@@ -9,8 +9,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from splatmill.files import atomic_write
 from splatmill.schema import TIME_LAPSE
 from splatmill_worker.pipeline.live import most_covering
@@ -56,12 +54,10 @@ class TimeLapse:
         antialiased: bool = False,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
-        self._folder, self._clock, self._antialiased = folder, clock, antialiased
+        self._folder, self._world, self._clock, self._antialiased = folder, world, clock, antialiased
         if anew:
             shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True, exist_ok=True)
-        self._scale = 1.0 / world.normalization.scale
-        self._shift = torch.from_numpy(-self._scale * world.normalization.translation - world.offset)
         self._taken = len(list(folder.glob("*.json")))
         self._next: int | None = None
         self._began, self._from = clock(), 0.0
@@ -92,7 +88,7 @@ class TimeLapse:
         if not self.seconds:
             self._drop_from(step)
         scene = gaussians_of(run.engine)
-        shown = most_covering(scene.padded(0), MOST_GAUSSIANS).moved(self._scale, self._shift)
+        shown = self._world.gaussians(most_covering(scene.padded(0), MOST_GAUSSIANS))
         path = self._folder / f"{self._taken:03d}.ply"
         atomic_write(path, compressed_ply.encode(shown, antialiased=self._antialiased))
         facts = {"step": step, "seconds": run.clock.seconds, "gaussians": scene.count, "shown": shown.count}

@@ -15,6 +15,7 @@ from splatmill.files import atomic_write
 from splatmill.schema import CameraSpec, ModelCamera, ModelCameras, ModelFrame
 from splatmill_worker.scene import Camera, Normalization, Scene
 from splatmill_worker.splat.formats import ply
+from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.report.held_out import write_held_out
 from splatmill_worker.splat.train.loop import Trained
@@ -54,6 +55,12 @@ class ExportWorld:
         original = self.normalization.undo_camera(camera)
         return original.moved_to(original.center - self.offset)
 
+    def gaussians(self, gaussians: Gaussians) -> Gaussians:
+        """Gaussians of the training world in this world."""
+        scale = 1.0 / self.normalization.scale
+        shift = -scale * self.normalization.translation - self.offset
+        return gaussians.moved(scale, torch.from_numpy(shift))
+
 
 @dataclass(frozen=True)
 class Exported:
@@ -73,13 +80,10 @@ def export(
     out: Path, trained: Trained, plan: Plan, world: ExportWorld, held_out: Sequence[TrainingView]
 ) -> Exported:
     """Write model.ply, cameras.json, frame.json if there is a frame, and the held-out photos into the folder `out`."""
-    scale = 1.0 / world.normalization.scale
-    shift = -scale * world.normalization.translation - world.offset
-    gaussians = trained.gaussians.moved(scale, torch.from_numpy(shift))
     x, y, z = world.offset
     written = ply.write(
         out / "model.ply",
-        gaussians,
+        world.gaussians(trained.gaussians),
         offset=(float(x), float(y), float(z)),
         antialiased=plan.antialias,
         degree=plan.schedule.degree,
