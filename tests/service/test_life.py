@@ -6,6 +6,7 @@ The pipeline is a stand-in: nothing here says that a model looks like its photos
 import hashlib
 import json
 import time
+from datetime import datetime
 
 import pytest
 
@@ -167,6 +168,6 @@ def test_many_small_jobs_end_in_order_each_run_once(service: Up) -> None:
     jobs = [service.submit(steps=1, pause=0.0) for _ in range(5)]
     ended = [service.ended(job_id) for job_id in jobs]
     assert {job["state"] for job in ended} == {"succeeded"}
-    finished = [job["finished_at"] for job in ended]
+    finished = [datetime.fromisoformat(job["finished_at"]) for job in ended]
     assert finished == sorted(finished)
     assert wait_for(lambda: all(len(service.diary(job_id)) == 1 for job_id in jobs))
