@@ -51,11 +51,12 @@ fresh: ## make a bare Debian, and run `make demo` and `make test` there (as root
 coverage: $(VENV)/.installed-dev ## run all tests and print their coverage, which takes a good deal longer
 	$(PYTEST) --cov $(PYTEST_ARGS)
 
-check: mutants ## ruff, mypy, import rules, TypeScript over the web page, the list of mutations
+check: mutants ## ruff, mypy, import rules, words, TypeScript over the web page, the list of mutations
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python -m tests.support.words
 	$(BIN)/python server/web/packages.py check
 
 mutants: $(VENV)/.installed-dev ## check the list of mutations of the kernels (`worker/mutations/run.py` tries them, for hours)

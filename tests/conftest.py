@@ -32,7 +32,7 @@ gc.disable()
 
 
 def pytest_collection_finish() -> None:
-    """The collector begins its work, and leaves out what is there by now."""
+    """The collector begins its work, and leaves out the objects made so far."""
     gc.freeze()
     gc.enable()
 

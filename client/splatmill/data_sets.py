@@ -157,9 +157,9 @@ def find_cameras(names: Sequence[str]) -> Cameras | None:
             top, rank = _place(folder)
             # A file called cameras.txt in some folder is a model only together with its images.
             if top == "" or f"{folder.lower()}images{base[-4:]}" in lower:
-                found = models.setdefault(top, [])
-                if (rank, folder) not in found:
-                    found.append((rank, folder))
+                ranked_folders = models.setdefault(top, [])
+                if (rank, folder) not in ranked_folders:
+                    ranked_folders.append((rank, folder))
     for top, ranked in captured.items():
         transforms.setdefault(top, ranked[min(ranked)])
     tops = sorted({*transforms, *models}, key=lambda top: (top.count("/"), top))
@@ -217,9 +217,9 @@ def _place(folder: str) -> tuple[str, int]:
     """The data set that a folder with a COLMAP model belongs to, and the rank of its place there."""
     # "colmap/sparse/" ends in "sparse/" too, so that the longest place is asked for first.
     for rank in (1, 0, 2):
-        found = _PATTERNS[rank].search(folder)
-        if found:
-            return folder[: found.start()], rank
+        match = _PATTERNS[rank].search(folder)
+        if match:
+            return folder[: match.start()], rank
     return folder, len(PLACES)
 
 

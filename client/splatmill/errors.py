@@ -184,7 +184,7 @@ def invalid_request(error: "ValidationError", code: str = "invalid_request") -> 
         if entry["type"] == "extra_forbidden":
             clauses.append(f"there is no option {place!r}")
         else:
-            seen = f" (got {entry['input']!r})" if isinstance(entry["input"], str | int | float) else ""
-            clauses.append(f"{place}: {message}{seen}" if place else message)
+            value = f" (got {entry['input']!r})" if isinstance(entry["input"], str | int | float) else ""
+            clauses.append(f"{place}: {message}{value}" if place else message)
     text = "; ".join(clauses).removesuffix(".")
     return InvalidRequest(Problem.of(code, f"{text}."))

@@ -11,7 +11,7 @@ from splatmill_server.base.scrape import families, of_disk, of_renderer
 
 INTRODUCTION = """# Metrics
 
-Everything that `GET /metrics` of an API process tells, generated from the program. Where there are several processes,
+All metrics in `GET /metrics` of an API process, generated from the program. Where there are several processes,
 the last column says how their values are put together: `sum` for what each counts for itself, `max` or `min` for what
 each reads from the same place, so that adding would count it several times. Counters and histograms that all
 processes share are in Redis. One that comes back empty begins at zero, as a counter of a restarted process does.

@@ -154,7 +154,7 @@ class Models:
         return ModelPage(models=found, cursor=following)
 
     def _listed(self, model_ids: Sequence[str], wanted: Filter) -> dict[str, Model]:
-        """Return those of these models that `wanted` admits, by id. What storage tells of one is kept for lists."""
+        """Return those of these models that `wanted` admits, by id. What was read of one is kept for lists."""
         known = {name: _kept(kept) for name, kept in self.lists.records("models", model_ids).items()}
         asked = [
             name
@@ -297,7 +297,7 @@ class Models:
 
 
 def _ended(record: Job) -> Ended:
-    """Return what a list of models tells of the record of one."""
+    """Return what a list of models shows of the record of one."""
     moment = lists.milliseconds(record.finished_at or record.created_at)
     return Ended(moment, record.owner or DEFAULT_OWNER, record.name)
 

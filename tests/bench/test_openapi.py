@@ -1,4 +1,4 @@
-"""`bench openapi`: its page tells what failed. Not proved here: the requests themselves (server/bench/openapi.md)."""
+"""`bench openapi`: its page lists what failed. Not proved here: the requests themselves (server/bench/openapi.md)."""
 
 import openapi
 

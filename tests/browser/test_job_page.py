@@ -378,7 +378,7 @@ def test_the_course_of_a_job_follows_from_its_events(page: Page) -> None:
         *([52 + step / 10, metric(step)] for step in (10, 20, 30)),
         [60, {"type": "log", "message": "x"}],
     ]
-    # The worker was killed: the next attempt goes on from a checkpoint at step 15, and measures again what follows.
+    # The worker was killed: the next attempt continues from a checkpoint at step 15, and measures again what follows.
     resumed = [*trained, [70, state("queued")], [80, state("training"), 2], [81, metric(20), 2]]
     again = page.evaluate(COURSE, resumed)
     assert again["steps"] == [10, 20]

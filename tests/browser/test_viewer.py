@@ -120,7 +120,7 @@ def test_the_canvas_shows_what_the_renderer_renders(service: Up, model: SmallMod
     assert len({str(look["camera_to_world"]) for look in looks}) == 4
     off = camera(shown)
     off["fov_y_deg"] += 1
-    assert psnr(pixels(shown), rendered(service.http, model, off)) < agreement - 5, "it tells one degree"
+    assert psnr(pixels(shown), rendered(service.http, model, off)) < agreement - 5, "it detects one degree"
 
 
 def test_the_start_is_upright_and_looks_at_the_middle(shown: Page) -> None:

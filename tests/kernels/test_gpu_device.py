@@ -1,4 +1,4 @@
-"""What is said and done where there is no usable GPU, and that importing the package touches neither Triton nor a GPU.
+"""Messages and choices where there is no usable GPU, and that importing the package touches neither Triton nor a GPU.
 
 A card that is too old is played by replacing what torch answers; the memory budget is arithmetic, not a measurement.
 """

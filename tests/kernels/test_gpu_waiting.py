@@ -2,7 +2,7 @@
 
 In Triton's interpreter this proves that no step calls torch for a value, for a shape that depends on one, or for a copy
 that waits, and that what a step measured is fetched while it is late. It does not prove that an operation of torch that
-is said to be asynchronous is: on a GPU, torch's own check of synchronisations runs in the same tests. A kernel's first
+is called asynchronous is: on a GPU, torch's own check of synchronisations runs in the same tests. A kernel's first
 launches, which the autotuner times, do wait.
 """
 

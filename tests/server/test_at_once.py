@@ -72,7 +72,7 @@ def apps(
     slow_lists: None, serve: Serve, peer: ScriptedServer, monkeypatch: pytest.MonkeyPatch
 ) -> list[ServedApp]:
     monkeypatch.setattr(imports, "_PAUSE_SECONDS", 3600.0)
-    # Nothing listens where the renderer is said to be, so that videos wait.
+    # Nothing listens at the address of the renderer, so that videos wait.
     settings: dict[str, Any] = {
         "outgoing_allow": peer.url.removeprefix("http://"),
         "renderer_url": "http://127.0.0.1:1",

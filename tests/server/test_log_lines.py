@@ -1,4 +1,4 @@
-"""A line of a worker's log is one JSON object, whatever is said, with what it belongs to.
+"""A line of a worker's log is one JSON object, whatever the message, with what it belongs to.
 
 Not proved here: that workers bind what they do (tests/worker/service/test_rq_worker.py).
 """

@@ -55,7 +55,7 @@ def test_every_metric_that_is_asked_for_exists_and_every_one_is_shown() -> None:
     asked = set().union(*map(named_in, QUERIES))
     assert asked <= set(metrics.names())
     shown = set().union(*map(named_in, TARGETS))
-    assert shown == set(metrics.names()), "a metric that nobody looks at is not needed"
+    assert shown == set(metrics.names()), "a metric that no panel shows is not needed"
 
 
 @pytest.mark.parametrize("query", QUERIES)
@@ -73,7 +73,7 @@ def test_what_a_running_server_tells_is_documented(app: ServedApp) -> None:
     app.job()
     told = {found.name for found in text_string_to_metric_families(app.http.get("/metrics").text)}
     documented = {name.removesuffix("_total") for name in metrics.names()}
-    # prometheus_client tells beside each counter and histogram when it began.
+    # prometheus_client adds to each counter and histogram when it began.
     assert {name.removesuffix("_created") for name in told} <= documented | {"splatmill_jobs"}
     page = metrics.page()
     assert all(f"`{name}`" in page for name in metrics.names())

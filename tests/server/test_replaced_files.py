@@ -24,7 +24,7 @@ def app(serve: Serve, request: pytest.FixtureRequest) -> Iterator[ServedApp]:
 
 
 class Preview:
-    """The preview of a job, which changes between two looks at it."""
+    """The preview of a job, which changes between two requests."""
 
     def __init__(self, app: ServedApp) -> None:
         job_id = app.job()

@@ -234,7 +234,7 @@ PLANTED: dict[str, tuple[Callable[[Ended], Any], str]] = {
         "in the lists of ['succeeded', 'unfinished']",
     ),
     "Redis holds a stray": (lambda e: e.redis.set(keys.attempts(OTHER), 1), "storage has no such job"),
-    "Redis tells another end": (
+    "Redis has another end": (
         lambda e: e.redis.delete(keys.states(e.job)),
         "state of",
     ),

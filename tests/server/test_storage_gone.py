@@ -1,6 +1,6 @@
 """Who reads what storage says when it fails: its messages name folders, hosts and buckets, and only admins see them.
 
-Not proved here: how the server goes on when storage is back (test_bucket), and what Redis says (test_redis_gone).
+Not proved here: how the server recovers when storage is back (test_bucket), and what Redis says (test_redis_gone).
 """
 
 import shutil

@@ -1,5 +1,5 @@
 """kill -9 of anything: the trainer, the worker, the API, Redis, the whole service. Each job still ends succeeded,
-goes on from its checkpoint, and never runs twice at once.
+continues from its checkpoint, and never runs twice at once.
 
 Does not cover the loss of a machine among several: there the heartbeat decides, which tests/server covers.
 """

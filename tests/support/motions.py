@@ -14,7 +14,7 @@ POINTS, OBSERVED = 300, 100
 """Points of the scene, and those that a photo observes at most."""
 
 Motion = Callable[[float], tuple[list[float], list[float]]]
-"""Where the camera is, and which point it looks at, at a time from 0 to 1."""
+"""Where the camera is, and which point it faces, at a time from 0 to 1."""
 
 
 def circle(pitch: float) -> Motion:

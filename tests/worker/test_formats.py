@@ -1,6 +1,6 @@
 """Files of the first version are read by the worker of today: an interrupted job keeps its plan and its checkpoint.
 
-Not proved here: that the training goes on well from there (tests/worker/splat/train resumes its own checkpoints).
+Not proved here: that the training continues well from there (tests/worker/splat/train resumes its own checkpoints).
 """
 
 import json

@@ -1,4 +1,4 @@
-"""Proves that what is wrong with a file is said in plain words: no message of Python, and no path of the machine.
+"""Proves that the faults of a file are reported in plain words: no message of Python, and no path of the machine.
 
 Not proven here: that every damaged file is refused at all (tests/hostile).
 """

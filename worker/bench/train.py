@@ -92,7 +92,9 @@ def main(argv: list[str]) -> int:
         try:
             whole = _measure(wanted, files.rows, asked.work, asked.lpips) and not wanted.absent
         except KeyboardInterrupt:
-            print(f"\nStopped. Finished rows are in {files.rows}; the same command goes on.", file=sys.stderr)
+            print(
+                f"\nStopped. Finished rows are in {files.rows}; the same command continues.", file=sys.stderr
+            )
             return 130
     found, references = lines(files.rows), lines(REFERENCES)
     if not found:
@@ -115,7 +117,7 @@ def _wanted(asked: argparse.Namespace) -> Wanted:
     if asked.lpips:
         from _train.lpips import Lpips  # loads torch
 
-        Lpips(*asked.lpips)  # what is wrong with the files is said before anything is measured
+        Lpips(*asked.lpips)  # errors of the files are raised before anything is measured
     names = _split(asked.configs) or [configurations.DEFAULT]
     if names == ["all"]:
         names = list(configurations.CONFIGURATIONS)
@@ -142,7 +144,7 @@ def _measure(wanted: Wanted, path: Path, work: Path, lpips: list[Path]) -> bool:
     whole = not unusable
     if todo:
         left = format_duration(estimate.seconds_left(todo, found))
-        print(f"About {left}. Ctrl-C loses the row in work at most; the same command goes on.", flush=True)
+        print(f"About {left}. Ctrl-C loses the row in work at most; the same command continues.", flush=True)
     for number, run in enumerate(todo):
         if idle(run, found):
             print(f"[{number + 1}/{len(todo)}] {run}: the default's plan already, nothing to measure")

@@ -258,7 +258,7 @@ class QuotaReached(WorkerError):
 
 
 class DiskReserveReached(WorkerError):
-    """The worker's disk is full but for the reserve. What the attempt has stored is kept, and a restart goes on.
+    """The worker's disk is full but for the reserve. What the attempt has stored is kept, and a restart continues.
 
     folder: the worker's data folder.
     free, reserve, needed: bytes that are free, that stay free, and that were to be written.
@@ -271,7 +271,7 @@ class DiskReserveReached(WorkerError):
             f"The disk of the worker's data folder {folder} has {format_bytes(free)} left{wanted}; "
             f"{format_bytes(reserve)} stay free.",
             facts={"free": free, "reserve": reserve, "needed": needed},
-            advice="Free space on that disk, then restart the job: it goes on from its last checkpoint.",
+            advice="Free space on that disk, then restart the job: it continues from its last checkpoint.",
         )
         self.folder = folder
         self.free = free

@@ -128,7 +128,7 @@ def lock(job_id: str) -> str:
 
 
 def watched(job_id: str) -> str:
-    """Return the key of a string that exists while somebody looks at the scene in training. It expires.
+    """Return the key of a string that exists while somebody watches the scene in training. It expires.
 
     Only the server writes it, and the worker makes snapshots while it is there.
     """

@@ -147,9 +147,9 @@ def newest(
 def members(connection: redis.Redis, named: str, batch: int) -> Iterator[list[str]]:
     """Yield the ids of a list in batches, oldest first. Ids that are added meanwhile come too."""
     start = 0
-    while found := cast(list[bytes], connection.zrange(named, start, start + batch - 1)):
-        yield [member.decode() for member in found]
-        start += len(found)
+    while ids := cast(list[bytes], connection.zrange(named, start, start + batch - 1)):
+        yield [member.decode() for member in ids]
+        start += len(ids)
 
 
 def clear(connection: redis.Redis, kind: Kind) -> None:

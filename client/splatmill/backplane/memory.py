@@ -9,7 +9,7 @@ import redis
 from splatmill.schema import format_bytes
 
 ALARM = 0.9
-"""Share of its limit from which Redis is said to be nearly full."""
+"""Share of its limit from which Redis counts as nearly full."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ def read(connection: redis.Redis) -> RedisMemory:
     return of(connection.info("memory"))
 
 
-def of(found: Mapping[str, Any]) -> RedisMemory:
+def of(info: Mapping[str, Any]) -> RedisMemory:
     """Return the memory of Redis from its answer to `INFO memory`."""
-    limit = int(found.get("maxmemory", 0)) or None
-    return RedisMemory(int(found["used_memory"]), limit, str(found.get("maxmemory_policy", "noeviction")))
+    limit = int(info.get("maxmemory", 0)) or None
+    return RedisMemory(int(info["used_memory"]), limit, str(info.get("maxmemory_policy", "noeviction")))

@@ -49,9 +49,9 @@ def close(folder: Path | None, mask: int) -> None:
     """Take away the rights to a folder with secrets that a copy or a restored backup gave, and that `mask` does not."""
     if folder is None or not folder.is_dir():
         return
-    found = folder.stat()
-    if found.st_uid == os.geteuid() and found.st_mode & mask:
-        folder.chmod(stat.S_IMODE(found.st_mode) & ~mask)
+    status = folder.stat()
+    if status.st_uid == os.geteuid() and status.st_mode & mask:
+        folder.chmod(stat.S_IMODE(status.st_mode) & ~mask)
 
 
 def listen(path: Path, advice: str) -> socket.socket:

@@ -17,7 +17,7 @@ def redacted(url: str) -> str:
     return _SECRET.sub(r"\1***", _USERINFO.sub(_without_password, url))
 
 
-def _without_password(found: "re.Match[str]") -> str:
-    user, colon, _ = found[0].partition(":")
+def _without_password(address: "re.Match[str]") -> str:
+    user, colon, _ = address[0].partition(":")
     # Without a colon, the only part may be a token.
     return f"{user}:***@" if colon and "@" not in user and "/" not in user else "***@"

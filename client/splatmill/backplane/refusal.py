@@ -69,10 +69,10 @@ def code_of(error: redis.ResponseError) -> str | None:
     for kind, code in _CODE_OF.items():
         if isinstance(error, kind):
             return code
-    found = _CODE.search(str(error))
-    if found is None and any(text in str(error) for text in _SCRIPT_DENIED):
+    match = _CODE.search(str(error))
+    if match is None and any(text in str(error) for text in _SCRIPT_DENIED):
         return "NOPERM"
-    return found[1] if found else None
+    return match[1] if match else None
 
 
 @contextmanager

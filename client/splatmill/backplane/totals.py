@@ -125,7 +125,7 @@ def read(stored: Mapping[bytes, bytes]) -> dict[str, Counted]:
     What this version does not know is left out.
     """
     known = {total.name: total for total in TOTALS}
-    found = {name: Counted() for name in known}
+    counted = {name: Counted() for name in known}
     for named, value in stored.items():
         name, *rest = named.decode("utf-8", "replace").split("|")
         total = known.get(name)
@@ -133,15 +133,15 @@ def read(stored: Mapping[bytes, bytes]) -> dict[str, Counted]:
             continue
         labels = tuple(rest[: len(total.labels)])
         if not total.bounds:
-            found[name].values[labels] = float(value)
+            counted[name].values[labels] = float(value)
             continue
         empty = Distribution([0] * (len(total.bounds) + 1))
-        distribution = found[name].distributions.setdefault(labels, empty)
+        distribution = counted[name].distributions.setdefault(labels, empty)
         if rest[-1] == _SUM:
             distribution.sum = float(value)
         elif rest[-1].isdigit() and int(rest[-1]) < len(distribution.counts):
             distribution.counts[int(rest[-1])] = round(float(value))
-    return found
+    return counted
 
 
 def observing(total: Total) -> str:

@@ -81,16 +81,16 @@ class Commands(TyperGroup):
         if cmd_name not in COMMANDS:
             return None
         module, function = COMMANDS[cmd_name]
-        found = getattr(import_module(module), function)
-        if isinstance(found, typer.Typer):  # a group of commands
-            for registered in found.registered_commands:
+        entry = getattr(import_module(module), function)
+        if isinstance(entry, typer.Typer):  # a group of commands
+            for registered in entry.registered_commands:
                 registered.callback = with_profile(registered.callback) if registered.callback else None
         else:
             single = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
             settings = PASS_ARGUMENTS_ON if cmd_name in ("up", "doctor", "bench") else None
-            single.command(cmd_name, context_settings=settings)(with_profile(found))
-            found = single
-        command: Any = typer.main.get_command(found)
+            single.command(cmd_name, context_settings=settings)(with_profile(entry))
+            entry = single
+        command: Any = typer.main.get_command(entry)
         command.name, command.rich_help_panel = cmd_name, heading_of(cmd_name)
         return command
 
@@ -119,8 +119,8 @@ app = typer.Typer(
 )
 
 
-def _version(wanted: bool) -> None:
-    if wanted:
+def _version(requested: bool) -> None:
+    if requested:
         typer.echo(f"splatmill {__version__}")
         raise typer.Exit
 

@@ -83,7 +83,7 @@ class CameraSpec(Request):
         fov_y_deg: float = 50.0,
         up: Sequence[float] = (0.0, 0.0, 1.0),
     ) -> Self:
-        """Return a camera at `eye` that looks at `target`, with `up` pointing upwards in the image.
+        """Return a camera at `eye` that points at `target`, with `up` pointing upwards in the image.
 
         `eye` and `target` are in world units, `fov_y_deg` is the vertical field of view in degrees. Raises ValueError
         when eye and target coincide, or when the viewing direction is parallel to `up`.

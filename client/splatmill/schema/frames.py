@@ -43,10 +43,10 @@ def known_distance(text: str) -> KnownDistance:
     if len(words) != 3:
         raise ValueError(f"{text[:80]!r} is no distance between two photos; {form}")
     first, second, length = words
-    found = _LENGTH.fullmatch(length.lower())
-    if found is None or found[2] not in _METRES:
+    match = _LENGTH.fullmatch(length.lower())
+    if match is None or match[2] not in _METRES:
         raise ValueError(f"{length[:20]!r} is no length in {', '.join(_METRES)}; {form}")
-    metres = float(found[1]) * _METRES[found[2]]
+    metres = float(match[1]) * _METRES[match[2]]
     if not 0.0 < metres < math.inf:
         raise ValueError(f"the distance between {first!r} and {second!r} is {length}; give one above zero")
     if first == second:

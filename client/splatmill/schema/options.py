@@ -287,7 +287,7 @@ class TrainOptions(Request):
         max_length=512,
         description=(
             'Distance between the cameras of two photos, as in "a.jpg b.jpg 2.5m", in mm, cm, m, km, in or ft: '
-            "the model is then in metres. Left out, GPS tells metres where the photos have it and cover enough "
+            "the model is then in metres. Left out, metres follow from GPS where the photos have it and cover enough "
             "ground, and the unit is arbitrary otherwise. Not for cameras that were given, which are never moved."
         ),
         json_schema_extra=_CAMERAS,

@@ -22,13 +22,13 @@ def keep_readable(
     try:
         return validate(dict(record)), []
     except ValidationError as error:
-        found = {
+        unreadable = {
             str(entry["loc"][depth]): entry["msg"]
             for entry in error.errors(include_url=False, include_input=False)
             if len(entry["loc"]) > depth
         }
-        kept = {name: value for name, value in record.items() if name not in found}
+        kept = {name: value for name, value in record.items() if name not in unreadable}
         if len(kept) == len(record):
             raise
     value, more = keep_readable(validate, kept, depth)
-    return value, [*(f"{name}: {reason}" for name, reason in found.items()), *more]
+    return value, [*(f"{name}: {reason}" for name, reason in unreadable.items()), *more]

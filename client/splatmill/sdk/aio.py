@@ -127,8 +127,8 @@ class AsyncClient:
 
         Raises NothingToUpload, ConnectionFailed, or a subclass of `Refused`.
         """
-        given, model = with_start_model(options, path)
-        checked = train_options(given)
+        arguments, model = with_start_model(options, path)
+        checked = train_options(arguments)
         capture, uploaded = await self.upload(
             path, name=name, on_progress=on_progress, model=model, resume=True
         )
@@ -154,8 +154,8 @@ class AsyncClient:
 
         Raises NothingToUpload, ConnectionFailed, or a subclass of `Refused`.
         """
-        found = find_files(path)
-        files = [*found.files, *([start_model(model)] if model is not None else [])]
+        capture_files = find_files(path)
+        files = [*capture_files.files, *([start_model(model)] if model is not None else [])]
         if capture is None:
             body = {"name": name or printable(Path(path).expanduser().resolve().name)}
             if resume:
@@ -165,8 +165,8 @@ class AsyncClient:
         else:
             target = await self.capture(capture)
         uploaded = await upload(self.connection, target.id, files, on_progress, stored_files=target.files)
-        unnamed = tuple((name, Problem.of("name_invalid", why)) for name, why in found.left_out)
-        return target, replace(uploaded, refused=(*unnamed, *uploaded.refused), renamed=found.renamed)
+        unnamed = tuple((name, Problem.of("name_invalid", why)) for name, why in capture_files.left_out)
+        return target, replace(uploaded, refused=(*unnamed, *uploaded.refused), renamed=capture_files.renamed)
 
     async def submit(
         self,
@@ -236,8 +236,8 @@ class AsyncClient:
         with the scope admin. Pages are requested as needed.
         """
         states = [state] if isinstance(state, str) else list(state or ())
-        wanted = {"state": states or None, "name": name, "capture": capture, "owner": owner}
-        return self._entries(JobPage, "/v1/jobs", lambda page: page.jobs, limit, wanted)
+        filters = {"state": states or None, "name": name, "capture": capture, "owner": owner}
+        return self._entries(JobPage, "/v1/jobs", lambda page: page.jobs, limit, filters)
 
     async def model(self, model_id: str) -> AsyncModelHandle:
         """Return the finished model with this id, which is that of its job."""
@@ -265,7 +265,7 @@ class AsyncClient:
     ) -> Estimate:
         """Return how long a job on `photos` photos would take, derived from the jobs that the server has finished.
 
-        `posed` tells that the cameras come with the photos. Nothing is created. Raises InvalidRequest for options that
+        `posed` states that the cameras come with the photos. Nothing is created. Raises InvalidRequest for options that
         the server does not accept.
         """
         chosen = options.model_dump(mode="json", exclude_unset=True) if options is not None else {}
@@ -307,16 +307,16 @@ class AsyncClient:
         path: str,
         entries: Callable[[P], list[T]],
         limit: int | None,
-        wanted: Mapping[str, Any],
+        filters: Mapping[str, Any],
     ) -> AsyncIterator[T]:
         """Yield at most `limit` entries of the list at `path`, which comes in pages of the type `kind`."""
         cursor: str | None = None
         left = limit
         while left is None or left > 0:
             size = PAGE if left is None else min(left, PAGE)
-            params = {"limit": size, "cursor": cursor, **wanted}
-            given = {key: value for key, value in params.items() if value is not None}
-            page = read_answer(kind, await self.connection.request("GET", path, params=given))
+            params = {"limit": size, "cursor": cursor, **filters}
+            query = {key: value for key, value in params.items() if value is not None}
+            page = read_answer(kind, await self.connection.request("GET", path, params=query))
             for entry in entries(page)[:left]:
                 yield entry
             left = None if left is None else left - len(entries(page))

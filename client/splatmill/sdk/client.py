@@ -447,7 +447,7 @@ class Client:
     def estimate(self, photos: int, options: TrainOptions | None = None, *, posed: bool = False) -> Estimate:
         """Return how long a job on `photos` photos would take, derived from the jobs that the server has finished.
 
-        `posed` tells that the cameras come with the photos. Nothing is created. Raises InvalidRequest for options that
+        `posed` states that the cameras come with the photos. Nothing is created. Raises InvalidRequest for options that
         the server does not accept.
         """
         return self._loop.run(self._async.estimate(photos, options, posed=posed))

@@ -35,7 +35,7 @@ from splatmill.transfer.uploads import OnProgress
 
 
 class Imports:
-    """Lets the server fetch files of a capture, and tells how far they are."""
+    """Lets the server fetch files of a capture, and reports how far they are."""
 
     def __init__(self, loop: BackgroundLoop, twin: AsyncImports) -> None:
         self._loop = loop

@@ -14,7 +14,7 @@ _LONGEST_POLL = 5.0
 
 
 class AsyncImports:
-    """Lets the server fetch files of a capture, and tells how far they are."""
+    """Lets the server fetch files of a capture, and reports how far they are."""
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
@@ -78,12 +78,12 @@ class AsyncImports:
         """
         pause = _POLL_SECONDS
         while True:
-            found = await self.get(capture, import_id)
+            record = await self.get(capture, import_id)
             if on_progress is not None:
-                done = found.file.size if found.file is not None else found.received
-                on_progress(Progress(stage="uploading", done=done, total=found.size, note=found.name))
-            if found.state.final:
-                return found
+                done = record.file.size if record.file is not None else record.received
+                on_progress(Progress(stage="uploading", done=done, total=record.size, note=record.name))
+            if record.state.final:
+                return record
             await asyncio.sleep(pause)
             pause = min(pause * 1.5, _LONGEST_POLL)
 

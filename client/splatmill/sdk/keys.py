@@ -41,8 +41,8 @@ class AsyncKeys:
 
         Raises Conflict if the first key of a server does not have the scope admin.
         """
-        given = limits.model_dump() if isinstance(limits, KeyLimits) else dict(limits or {})
-        body = {"name": name, "owner": owner, "scopes": list(scopes), "limits": given}
+        limit_values = limits.model_dump() if isinstance(limits, KeyLimits) else dict(limits or {})
+        body = {"name": name, "owner": owner, "scopes": list(scopes), "limits": limit_values}
         request = _checked(CreateKey, body)
         # It is sent once: repeated after a lost answer, it would leave a key that nobody knows of.
         response = await self._connection.request("POST", "/v1/keys", json=request.model_dump(mode="json"))

@@ -188,7 +188,7 @@ class AsyncModelHandle:
         model, None for a preview. Raises InvalidRequest for values that are not valid, and for an edit that leaves
         nothing.
         """
-        given = {
+        values = {
             "box": box,
             "min_opacity": min_opacity,
             "max_size": max_size,
@@ -196,7 +196,7 @@ class AsyncModelHandle:
             "preview": preview,
         }
         try:
-            request = EditModel.model_validate(given)
+            request = EditModel.model_validate(values)
         except ValidationError as error:
             raise invalid_request(error) from error
         # Repeated after a lost answer, it would make a second model, so only a preview is.

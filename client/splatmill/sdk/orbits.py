@@ -59,13 +59,13 @@ class AsyncOrbits:
         """
         pause = _POLL_SECONDS
         while True:
-            found = await self.get(orbit_id)
+            record = await self.get(orbit_id)
             if on_progress is not None:
-                on_progress(Progress(stage="rendering", done=found.frames_done, total=found.frames))
-            if found.problem is not None:
-                raise error_for(found.problem)
-            if found.state.final:
-                return found
+                on_progress(Progress(stage="rendering", done=record.frames_done, total=record.frames))
+            if record.problem is not None:
+                raise error_for(record.problem)
+            if record.state.final:
+                return record
             await asyncio.sleep(pause)
             pause = min(pause * 1.5, _LONGEST_POLL)
 

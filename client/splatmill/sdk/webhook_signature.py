@@ -40,10 +40,10 @@ def verify_webhook(
 
     A webhook that was not answered is sent again with the same `webhook-id`, by which a receiver can recognise it.
     """
-    found = {str(name).lower(): str(value) for name, value in headers.items()}
+    lower_case = {str(name).lower(): str(value) for name, value in headers.items()}
     try:
-        message_id, timestamp, given = (
-            found[f"webhook-{part}"].strip() for part in ("id", "timestamp", "signature")
+        message_id, timestamp, signature_header = (
+            lower_case[f"webhook-{part}"].strip() for part in ("id", "timestamp", "signature")
         )
     except KeyError as error:
         raise InvalidWebhook(f"The header {error.args[0]} is missing.") from None
@@ -52,7 +52,7 @@ def verify_webhook(
     if abs((time.time() if now is None else now) - int(timestamp)) > tolerance:
         raise InvalidWebhook(f"The webhook is more than {tolerance:.0f} seconds old, or from the future.")
     data = body.encode() if isinstance(body, str) else bytes(body)
-    signatures = [part for part in given.split() if part.startswith("v1,")]
+    signatures = [part for part in signature_header.split() if part.startswith("v1,")]
     secrets = [secret] if isinstance(secret, str) else list(secret)
     matches = [
         hmac.compare_digest(sign(one, message_id, int(timestamp), data).encode(), signature.encode())

@@ -1,7 +1,7 @@
 """The upload of a large file in pieces, continued at the server's offset after any break.
 
 Nothing is kept on this machine: the server knows an upload by the file's name, size and digest, so a command that was
-killed and is run again goes on where it stopped.
+killed and is run again continues where it stopped.
 """
 
 import asyncio

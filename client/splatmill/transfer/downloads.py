@@ -66,11 +66,11 @@ async def download(
             part.discard()
     expected = sha256 or announced
     if expected is not None:
-        seen = await asyncio.to_thread(part.digest)
-        if seen != expected:
+        digest = await asyncio.to_thread(part.digest)
+        if digest != expected:
             part.discard()
             raise DownloadFailed(
-                f"The SHA-256 of the downloaded {target.name} is {seen[:12]}..., not {expected[:12]}...",
+                f"The SHA-256 of the downloaded {target.name} is {digest[:12]}..., not {expected[:12]}...",
                 "The partial file was removed; download it again.",
             )
     part.move_into_place()

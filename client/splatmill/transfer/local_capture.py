@@ -210,15 +210,15 @@ def find_files(path: str | os.PathLike[str]) -> Found:
                     ]
                 ),
             )
-    found = Found.of(files, ignored)
-    if not found.count(Role.images):
-        raise NothingToUpload(found.left_out[0][1], "Rename the files.")
+    capture_files = Found.of(files, ignored)
+    if not capture_files.count(Role.images):
+        raise NothingToUpload(capture_files.left_out[0][1], "Rename the files.")
     remarks = around + _left_out(unreadable) + unread(ignored) + ([] if poses else unread_cameras(ignored))
     beside = [name for name in ignored if _suffix(name) in VIDEO_SUFFIXES + ARCHIVE_SUFFIXES]
     if beside:
         remarks.append(f"Videos and zips are not used where there are photos: {listed(beside)}.")
     remarks += other_remarks(others) + _cameras_beside(root, cameras)
-    return replace(found, top=cameras.top, outputs=tuple(sorted(outputs)), remarks=tuple(remarks))
+    return replace(capture_files, top=cameras.top, outputs=tuple(sorted(outputs)), remarks=tuple(remarks))
 
 
 def _results(outputs: Iterable[str]) -> list[str]:
@@ -339,7 +339,7 @@ def _masks(pictures: list[str], top: str, photo_root: str) -> dict[str, str]:
 
 def _poses(cameras: Cameras, names: list[str]) -> dict[str, str]:
     """Return the local name of each pose file, with its name in the capture."""
-    found = {name: name.removeprefix(cameras.top) for name in cameras.transforms}
+    poses = {name: name.removeprefix(cameras.top) for name in cameras.transforms}
     places: list[str] = []
     for folder in cameras.models:
         # In a capture, COLMAP models always lie in the folders sparse/N.
@@ -351,8 +351,8 @@ def _poses(cameras: Cameras, names: list[str]) -> dict[str, str]:
             base = name.removeprefix(folder)
             stem, suffix = os.path.splitext(base.lower())
             if name.startswith(folder) and stem in MODEL_STEMS and suffix in MODEL_SUFFIXES:
-                found[name] = f"sparse/{number}/{base}"
-    return found
+                poses[name] = f"sparse/{number}/{base}"
+    return poses
 
 
 def _documents(root: Path, cameras: Cameras) -> list[dict[str, Any]]:

@@ -57,14 +57,14 @@ def choose_server(
         key = api_key if api_key is not None else environment[API_KEY_VARIABLE]
         address = server or environment[SERVER_VARIABLE] or DEFAULT_SERVER
         return ServerChoice(address, key, _first(verify, environment[CA_BUNDLE_VARIABLE], True), proxy)
-    found = read_profile(name)
-    keys = [found.api_key, environment[API_KEY_VARIABLE]]
-    bundles: list[Verify | None] = [found.ca_bundle, environment[CA_BUNDLE_VARIABLE]]
+    stored = read_profile(name)
+    keys = [stored.api_key, environment[API_KEY_VARIABLE]]
+    bundles: list[Verify | None] = [stored.ca_bundle, environment[CA_BUNDLE_VARIABLE]]
     if profile is None:  # the environment names it, and so its other variables come first
         keys.reverse()
         bundles.reverse()
     key = next((key for key in (api_key, *keys) if key is not None), None)
-    return ServerChoice(found.server, key, _first(verify, *bundles, True), proxy or found.proxy)
+    return ServerChoice(stored.server, key, _first(verify, *bundles, True), proxy or stored.proxy)
 
 
 def ssl_context(verify: Verify) -> ssl.SSLContext | bool:

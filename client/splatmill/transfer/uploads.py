@@ -109,7 +109,7 @@ class _Tally:
     next_report: float = 0.0
 
     def of(self, file: LocalFile) -> OnPosition:
-        """Return the function that tells how many bytes of a file were sent."""
+        """Return the function that is called with how many bytes of a file were sent."""
 
         return lambda position: self._at(file, position)
 

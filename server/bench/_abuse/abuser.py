@@ -3,7 +3,7 @@
     python -m _abuse.abuser '{"url": ..., "key": ..., "capture": ..., "model": ..., "link": ...,
                               "photo": ..., "read_key": ...}'
 
-It goes on until its input ends. Then the last line of its output is JSON: how many answers of each status every abuse
+It runs until its input ends. Then the last line of its output is JSON: how many answers of each status every abuse
 got. All that is asked for is what the HTTP API offers to every owner with a key.
 """
 

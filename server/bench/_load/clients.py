@@ -106,7 +106,7 @@ class Uploader(Client):
 
 
 class Viewer(Client):
-    """Looks at a model."""
+    """Fetches the files and pictures of a model."""
 
     fixed_count = VIEWERS
     wait_time = between(0.5, 1.5)

@@ -1,4 +1,4 @@
-"""What the pipelines' record (see `pipeline`) tells of attempts: which jobs got on, and what ran twice."""
+"""Attempts in the pipelines' record (see `pipeline`): which jobs made progress, and what ran twice."""
 
 from collections.abc import Collection, Iterable, Mapping
 from typing import Any

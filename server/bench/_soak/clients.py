@@ -80,7 +80,7 @@ class Clients:
     files: those of a capture of each kind.
     complaints: what no client should have met.
     captures: those that the service has accepted.
-    faults: names of the faults so far, and the monotonic time at which each was over; infinity: it goes on.
+    faults: names of the faults so far, and the monotonic time at which each was over; infinity: it is not over.
     """
 
     service: Service
@@ -240,5 +240,5 @@ class Clients:
 
 
 def _may_repeat(answer: httpx.Response) -> bool:
-    """Whether an answer tells the client to come again: a part is away, or the disk is full."""
+    """Whether an answer asks the client to come again: a part is away, or the disk is full."""
     return answer.status_code in (429, 502, 503, 504, 507)

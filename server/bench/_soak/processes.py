@@ -43,7 +43,7 @@ _LOOK_SECONDS = 0.15
 class Member:
     """A process of the service.
 
-    began: its start, which tells it from a later process of the same id.
+    began: its start, which distinguishes it from a later process of the same id.
     line: the roles from the supervisor down to it, its own last.
     above: the processes from the supervisor down to its parent.
     """
@@ -75,7 +75,7 @@ class Member:
 
 
 class Processes:
-    """Looks at the processes below this one, again and again, from `start` to `stop`.
+    """Lists the processes below this one, again and again, from `start` to `stop`.
 
     own: returns the children of this process that are no part of the service.
     top: the role of the first one, from which the others descend.

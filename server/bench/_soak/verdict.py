@@ -89,7 +89,7 @@ def lost(clients: Clients, jobs: list[str], models: list[str]) -> list[str]:
     for promise in clients.promises.values():
         if promise.failure is not None:
             found.append(f"{promise.job} failed: {promise.failure}")
-        elif promise.state in FINAL:  # of others, `settle` tells
+        elif promise.state in FINAL:  # `settle` judges the others
             if promise.job not in jobs:
                 found.append(f"{promise.job} was accepted and is not among the jobs")
             if (promise.state == "succeeded") != (promise.job in models):

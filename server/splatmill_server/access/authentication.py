@@ -56,7 +56,7 @@ class Authentication:
         )
 
     def again(self, request: Request) -> Callable[[], Awaitable[bool]]:
-        """Return a function that tells whether the request would still be let in; it looks every CACHE_SECONDS."""
+        """Return a function that checks, every CACHE_SECONDS, whether the request would still be accepted."""
         looked, let_in = time.monotonic(), True
 
         async def permitted() -> bool:

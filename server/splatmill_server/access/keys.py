@@ -63,7 +63,7 @@ class StoredKey(Key):
         """Return whether a secret with this SHA-256 is one of the key's at this moment. Takes constant time."""
         now = datetime.now(UTC)
         valid = [held.sha256 for held in self.secrets if held.until is None or now < held.until]
-        # Every digest is compared, so that the time tells nothing about which one matched.
+        # Every digest is compared, so that the time is no hint at which one matched.
         return sum(hmac.compare_digest(digest.encode(), one.encode()) for one in valid) > 0
 
     def public(self) -> Key:

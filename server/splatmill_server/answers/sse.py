@@ -90,7 +90,7 @@ class Follower:
         """Apply the events that the client has already seen; return False if the job had ended by then.
 
         A position beyond the events that the job has was not issued by this Redis, or Redis was restored from an older
-        copy. What the client has seen of a job that goes on is then unknown, so that it is sent everything.
+        copy. Which events of a running job the client has is then unknown, so all are sent.
         """
         self.fold = Fold(row)
         self._stored: Row = {}

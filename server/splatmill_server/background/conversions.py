@@ -37,7 +37,7 @@ STORED_AS_IT_IS = "ply"
 """Key of the format of model.ply, which needs no conversion."""
 
 POLL_SECONDS = 0.5
-"""Time between two looks at a conversion that another API process makes."""
+"""Time between two checks of a conversion that another API process makes."""
 
 
 @dataclass

@@ -1,8 +1,8 @@
 """Orbit videos: rendered in the background, a part at a time, and kept in storage with their model.
 
-An orbit video is a record, and a mark while it has not ended, so it goes on after a restart of the API or the renderer
-with the first frame that is not stored. Its id follows from the model and the request, so that the same request finds
-the same video.
+An orbit video is a record, and a mark while it has not ended, so that after a restart of the API or the renderer it
+continues with the first frame that is not stored. Its id follows from the model and the request, so that the same
+request finds the same video.
 """
 
 import hashlib

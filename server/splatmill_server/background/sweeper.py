@@ -27,7 +27,7 @@ from splatmill_server.space.usage import Usage
 log = structlog.get_logger()
 
 MOST = 200
-"""Records that one sweep deletes; the next one goes on."""
+"""Records that one sweep deletes; the next one continues."""
 
 _FIRST_SECONDS = 60.0
 """Seconds from the start of a process to its first sweep."""

@@ -28,7 +28,7 @@ _RENEW = (
 async def lease(connection: redis.Redis, kind: str, name: str) -> AsyncIterator[bool]:
     """Hold the lease on a thing while the context is open; yield False if another process holds it.
 
-    Raises redis.RedisError if the lease cannot be taken. If Redis is lost while it is held, the work goes on: what a
+    Raises redis.RedisError if the lease cannot be taken. If Redis is lost while it is held, the work continues: what a
     lease protects must be safe, though wasteful, to do twice.
     """
     key, token = keys.lease(kind, name), secrets.token_hex(8)

@@ -49,7 +49,7 @@ _LOCK_SECONDS = 30.0
 
 @dataclass(frozen=True)
 class Ended:
-    """What a list of models tells of a job that has succeeded.
+    """What a list of models shows of a job that has succeeded.
 
     moment: the time of its end in milliseconds.
     """

@@ -51,7 +51,7 @@ _FROM_ZERO: dict[str, tuple[tuple[str, ...], ...]] = {
 
 @dataclass(frozen=True)
 class Seen:
-    """What Redis tells at a scrape.
+    """The values in Redis at a scrape.
 
     now: time by the clock of Redis, seconds since 1970.
     waiting: what waits in the queue.
@@ -78,7 +78,7 @@ class Seen:
 
 
 def read(connection: redis.Redis) -> Seen:
-    """Return what Redis tells, in one round trip, and one more for the workers. Raises redis.RedisError."""
+    """Return the values in Redis, in one round trip, and one more for the workers. Raises redis.RedisError."""
     with connection.pipeline(transaction=False) as pipe:
         pipe.time()
         lines.ask(pipe)

@@ -43,7 +43,7 @@ class Digests:
     def __init__(self, storage: Storage) -> None:
         self._storage = storage
         # By capture, the files that this process has stored and no manifest holds, and when it last wrote a manifest.
-        # The time of its creation tells a capture from a deleted one that had its id.
+        # The time of its creation distinguishes a capture from a deleted one that had its id.
         self._new: OrderedDict[tuple[str, datetime], dict[str, CaptureFile]] = OrderedDict()
         self._written: dict[tuple[str, datetime], float] = {}
         self._lock = threading.Lock()

@@ -63,7 +63,7 @@ class UploadRecord(Response):
 
 @dataclass(frozen=True)
 class Standing:
-    """How far an upload is: its record, the bytes held, and seconds until it is deleted if nobody goes on with it."""
+    """How far an upload is: its record, the bytes held, and seconds until it is deleted if nobody continues it."""
 
     record: UploadRecord
     offset: int
@@ -395,8 +395,8 @@ def _wrong_length(expected: int, seen: int, *, offset: int | None = None) -> Pro
 def _superseded(held: int) -> ProblemError:
     return ProblemError(
         "upload_offset_differs",
-        "A later request goes on with this upload, so this one has ended.",
-        advice="Send one request at a time. HEAD tells how many bytes the server holds.",
+        "A later request continues this upload, so this one has ended.",
+        advice="Send one request at a time. HEAD answers how many bytes the server holds.",
         facts={"expected-offset": held},
         headers={UPLOAD_OFFSET: str(held), UPLOAD_COMPLETE: write_boolean(False)},
     )

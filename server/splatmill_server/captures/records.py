@@ -49,7 +49,7 @@ _RECENT_SECONDS = 5.0
 """Seconds for which uploads use a record that was read before. Their end looks whether the capture is still there."""
 
 DISK_STEP = 8 << 20
-"""Bytes of a file that arrive between two looks at the room on the disk."""
+"""Bytes of a file that arrive between two checks of the room on the disk."""
 
 STALE_SECONDS = 24 * 3600
 """Age at which an unfinished upload counts as abandoned."""
@@ -73,7 +73,7 @@ class Captures:
         self.digests = Digests(storage)
         self._recent: dict[str, tuple[float, Capture]] = {}
         # Number of files per capture, as last seen: listing the folder at each upload would take quadratic time. The
-        # time of its creation tells a capture from a deleted one that had its id, maybe deleted by another process.
+        # time of its creation distinguishes a capture from one of the same id that another process may have deleted.
         self._counts: dict[tuple[str, datetime], int] = {}
 
     def create(self, name: str | None = None, *, owner: str, key: str | None = None) -> tuple[Capture, bool]:

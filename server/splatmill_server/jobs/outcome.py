@@ -52,7 +52,7 @@ def stage_seconds(row: JobRow, states: Sequence[StoredEvent]) -> dict[str, float
     """Return the seconds that the attempts of a generation spent in each stage.
 
     A stage ends with the next state of the same attempt, or with the job. What an attempt did last before it was lost
-    is left out: nothing tells when it ended.
+    is left out: nothing records when it ended.
     """
     folded = Fold(row)
     counting = [stored for stored in states if isinstance(stored.event, StateEvent) and folded.apply(stored)]

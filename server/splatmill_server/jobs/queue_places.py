@@ -19,7 +19,7 @@ microseconds."""
 
 
 class QueuePlaces:
-    """Tells the places of jobs that wait, for one service.
+    """Computes the places in the queue of waiting jobs, for one service.
 
     What workers there are, and what they run, is kept for a time that grows with their number: where there are a
     thousand, it is read once a second, and not for each job that is created or looked at.

@@ -268,7 +268,7 @@ class Jobs:
         if retired is not None:
             try:
                 requests.delete(self.connection, self.storage, retired)
-            except StorageError as error:  # what is left says nothing: the log in storage tells of the end
+            except StorageError as error:  # what is left shows nothing: the log in storage has the end
                 log.warning("the request of an ended job cannot be deleted", job=job_id, error=str(error))
 
     def _announce_end(self, found: JobRow) -> None:

@@ -21,7 +21,7 @@ WHOLE_SECONDS = 60.0
 """Seconds for which the streams of an ended job stay whole."""
 
 _MOST = 500
-"""Number of jobs whose streams are shrunk at once; the next look goes on."""
+"""Number of jobs whose streams are shrunk at once; the next call continues."""
 
 _SHRUNK = (keys.progress, keys.log, keys.warnings, keys.curve)
 

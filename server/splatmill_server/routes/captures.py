@@ -150,7 +150,7 @@ async def put_file(
     """Upload a file. The same bytes may be sent again; other bytes under the same name are refused.
 
     With `Upload-Complete: ?0`, the file arrives in several requests, and can be continued after a break. The same file
-    (name, `Upload-Length` and digest) is then the same upload, and `Upload-Offset` tells where to go on.
+    (name, `Upload-Length` and digest) is then the same upload, and `Upload-Offset` is where to continue.
     """
     media_type = (
         request.headers.get("content-type", "application/octet-stream").partition(";")[0].strip().lower()

@@ -41,7 +41,7 @@ async def import_file(
     capture_id: CaptureId,
     request: Annotated[CreateImport, Body(examples=[{"url": "https://example.org/kitchen.zip"}])],
 ) -> Import:
-    """Fetch a file of the capture from an address. It is fetched in the background; `Location` tells how far it is."""
+    """Fetch a file of the capture from an address, in the background; `Location` answers how far it is."""
     owner = (await run_in_threadpool(service.captures.get_recent, capture_id)).owner
     size = RECORD_BYTES + len(json.dumps(request.url))
     async with service.quota.storing(who, owner, capture_id, size) as room:

@@ -1,4 +1,4 @@
-"""The endpoints of `/v1/keys`, for admins, and `/v1/me`, which tells a caller who it is."""
+"""The endpoints of `/v1/keys`, for admins, and `/v1/me`, which answers who the caller is."""
 
 from typing import Annotated
 

@@ -48,7 +48,7 @@ async def create_orbit(
 ) -> Orbit:
     """Render a video (MP4) that circles the scene once, in the background, and keep it with the model.
 
-    `Location` tells how many frames are rendered. The same request returns the same video, and begins one that has
+    `Location` answers how many frames are rendered. The same request returns the same video, and begins one that has
     failed again.
     """
     made = await service.orbits.create(model_id, body or OrbitRequest(), who)

@@ -156,7 +156,7 @@ async def get_metrics(service: Shared) -> Response:
 
 
 def _seen(service: Service) -> scrape.Seen | None:
-    """Return what Redis tells, or None if it does not answer."""
+    """Return the values in Redis, or None if it does not answer."""
     try:
         return scrape.read(service.redis)
     except redis.RedisError:

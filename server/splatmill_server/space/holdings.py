@@ -122,7 +122,7 @@ def scan(
     """Return all folders in storage with their owners.
 
     entries: all files in storage.
-    known: folders by their keys, as an earlier scan or the row of a job tells of them. The owner of a record never
+    known: folders by their keys, as an earlier scan or the row of a job has them. The owner of a record never
     changes, so that records are read once, and those of jobs that have rows never.
     job_owners: the owners of the jobs that have rows, for folders of jobs and of models that are not finished.
     """

@@ -147,7 +147,7 @@ def moment(seconds: float) -> datetime:
 
 
 def _told_by(job: JobUse) -> list[Holding]:
-    """Return the folders of a job and of its model, without their sizes, as the row of the job tells of them."""
+    """Return the folders of a job and of its model, without their sizes, as the row of the job has them."""
     if not job.readable:
         return []
     kinds = (StoredKind.job, StoredKind.model)

@@ -1,5 +1,5 @@
 """The service for the time of one call: it comes up, keeps to itself, ends whole, and says why when it cannot start.
-`splatmill train` loses nothing when it is interrupted, and the same command goes on (with a stand-in pipeline).
+`splatmill train` loses nothing when it is interrupted, and the same command continues (with a stand-in pipeline).
 
 Does not prove what the service does with a job; tests/service does. Here a job only has to reach its worker.
 """

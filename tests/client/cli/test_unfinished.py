@@ -1,4 +1,4 @@
-"""`splatmill train` without a server: a training that is interrupted in any way is kept, and the same command goes on.
+"""`splatmill train` without a server: an interrupted training is kept, and the same command continues it.
 
 The pipeline is a stand-in, except in the last test, which recovers cameras and trains.
 """
@@ -105,7 +105,7 @@ def command(tmp_path: Path) -> Command:
 def kept(command: Command, said: str) -> None:
     """Check that a command which was stopped says that the training is kept."""
     assert f"The training is kept in {command.data} (" in said
-    assert "The same command goes on" in said
+    assert "The same command continues" in said
 
 
 @pytest.mark.slow

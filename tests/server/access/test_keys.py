@@ -168,7 +168,7 @@ def test_a_stream_of_events_ends_with_its_key(app: ServedApp) -> None:
         pieces = answer.iter_text()
         assert "retry" in next(pieces)
         assert app.http.delete(f"/v1/keys/{ann['id']}", headers=auth).status_code == 204
-        assert "failed" not in "".join(pieces)  # it ends, while the job goes on
+        assert "failed" not in "".join(pieces)  # it ends, while the job runs
     assert app.http.get(f"/v1/jobs/{job_id}", headers=auth).json()["state"] == "queued"
 
 

@@ -317,7 +317,7 @@ def test_the_sdk_waits_with_progress_and_renders_nothing_twice(
         assert len(frames(path.read_bytes())) == 10
         assert (heard[-1].stage, heard[-1].done, heard[-1].total) == ("rendering", 10, 10)
         kept = model.orbits.list()
-        renderer.send_signal(signal.SIGSTOP)  # what is there needs no renderer
+        renderer.send_signal(signal.SIGSTOP)  # stored videos need no renderer
         try:
             model.orbit(tmp_path / "again.mp4", seconds=1, fps=10, width=64, height=48)
             with pytest.raises(WaitTimeout, match="orbit video"):

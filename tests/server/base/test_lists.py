@@ -146,7 +146,7 @@ def test_lists_are_made_from_storage_in_one_reading_of_each_record(seeded: tuple
     with counted() as operations:
         service.lists.ensure(0.0)
     ended = len(records.failed) + len(records.succeeded)
-    # capture.json of each; the log of each ended job, which tells of its model too; request and log of each queued one.
+    # capture.json of each; the log of each ended job, which has its model too; request and log of each queued one.
     assert operations.storage["get"] == COUNT + ended + 2 * len(records.queued)
     assert operations.storage["children"] == 3
     assert operations.storage["walk"] == 1

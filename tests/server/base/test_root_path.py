@@ -148,7 +148,7 @@ def test_every_address_in_an_answer_leads_through_the_proxy(
 )
 def test_a_page_finds_its_files_below_any_path(serve: Serve, settings: dict[str, str], path: str) -> None:
     app = serve(**settings)
-    # Without the setting, nothing tells the server of the path.
+    # Without the setting, the server does not know the path.
     with published(app, strip=True) as http:
         page = http.get(path)
         named = re.findall(r'(?:src|href)="([^"#]+)"', page.text)

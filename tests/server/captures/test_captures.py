@@ -290,7 +290,7 @@ def test_every_error_of_an_upload_names_its_file(serve: Serve, tmp_path: Path) -
         "images/sub/c.jpg",
     )
 
-    # In a form of many files, the name is all that tells which one was refused.
+    # In a form of many files, only the name shows which one was refused.
     files = [("images", ("a.jpg", PHOTO)), ("masks", ("b.png", b"")), ("images", ("c.jpg", PHOTO))]
     named(app.http.post("/v1/jobs", files=files), 422, "file_empty", "masks/b.png")
 

@@ -374,7 +374,7 @@ def test_the_limits_hold_from_the_first_request(serve: Serve) -> None:
     assert append(app, address, 0, b"x" * 600).status_code == 204
     problem(append(app, address, 600, iter([b"x" * 300, b"x" * 300])), 413, "body_too_large")
     assert offset(app, address) == 600
-    # Nothing tells where an empty file begins and ends.
+    # An empty file has no boundaries.
     empty = begin(app, capture_id, "images/empty.jpg", **{"Upload-Length": "0"}).headers["location"]
     problem(append(app, empty, 0, b"", complete=True), 422, "file_empty")
 

@@ -1,4 +1,4 @@
-"""Estimates of the time of a job: from which finished jobs, how they are scaled, and what is said without any.
+"""Estimates of the time of a job: from which finished jobs, how they are scaled, and the answer without any.
 
 Not proved here: how close an estimate comes. The records are those of a real job (tests/fixtures/formats), changed.
 """

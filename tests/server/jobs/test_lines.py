@@ -138,7 +138,7 @@ def test_what_is_handed_back_or_lost_once_comes_first_and_what_is_lost_again_com
     assert leases.requeue(connection, lease, if_expired=False) == "waiting"
     assert not lines.hand_back(connection, lease), "it was lost, and is not the worker's any more"
     lease = take(connection)
-    assert lease.entry == "job0-1", "a job that was interrupted goes on before others begin"
+    assert lease.entry == "job0-1", "a job that was interrupted continues before others begin"
     assert leases.requeue(connection, lease, if_expired=False) == "waiting"
     lease = take(connection)
     assert lease.entry == "job1-1", "a job that loses its worker again and again delays no other"
@@ -202,7 +202,7 @@ def test_a_job_says_where_it_stands_and_what_it_waits_for(app: ServedApp) -> Non
     assert shown(app, first) == (0, "any", False)
     assert shown(app, on_gpu) == (0, "gpu", False)
     listen(app.redis, "plain", "any", "cpu")
-    lines.took(app.redis, "any", 60)
+    lines.record_duration(app.redis, "any", 60)
     assert shown(app, second) == (1, None, True)
     assert shown(app, on_gpu) == (0, "gpu", False)
     info = app.http.get("/v1/info").json()

@@ -141,7 +141,7 @@ class Bench:
         return Answer(f"used: {len(scene.views)} cameras", " ".join([*notes, *scene.warnings, *said]))
 
     def start(self, data: bytes, suffix: str = ".ply") -> Answer:
-        """What the worker makes of a file to start from, whose suffix tells its format."""
+        """What the worker makes of a file to start from, whose suffix names its format."""
         path = write(self._fresh() / f"start{suffix}", data)
         try:
             gaussians = read_given_model(path, Normalization(1.0, np.zeros(3)), 1000).gaussians

@@ -68,7 +68,7 @@ def _viewmat(yaw: float, pitch: float, shift: tuple[float, float, float]) -> Ten
 def scene(
     name: str, n: int = 200, *, width: int = 61, height: int = 47, seed: int = 0, degree: int = 3
 ) -> Case:
-    """A cloud of moderate Gaussians in front of a camera that looks at them aslant."""
+    """A cloud of moderate Gaussians in front of a camera that faces them aslant."""
     g = torch.Generator().manual_seed(seed)
 
     def draw(*shape: int) -> Tensor:

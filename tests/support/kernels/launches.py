@@ -42,7 +42,7 @@ def looking_away() -> Iterator[None]:
 
 
 class WatchedKernel:
-    """A kernel that tells of its launches."""
+    """A kernel that records its launches."""
 
     def __init__(self, name: str, kernel: Any, told: Callable[[Launch], None]) -> None:
         self.name, self.kernel, self._told = name, kernel, told

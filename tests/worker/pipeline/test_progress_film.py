@@ -1,4 +1,4 @@
-"""Proves that a training is filmed from one view, off the clock, and that the film goes on after a cancelled attempt.
+"""Proves that a training is filmed from one view, off the clock, and that the film continues after a cancelled attempt.
 
 Does not prove that the film is pleasant to watch.
 """

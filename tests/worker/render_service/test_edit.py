@@ -1,4 +1,4 @@
-"""Proves which Gaussians an edit leaves, that its model is stored whole elsewhere, and that the error it tells is
+"""Proves which Gaussians an edit leaves, that its model is stored whole elsewhere, and that the error it reports is
 that of the renderer against the held-out photos.
 """
 

@@ -18,7 +18,7 @@ from splatmill_worker.render_service.joining import join
 
 
 def _frame(number: int) -> npt.NDArray[np.uint8]:
-    """A picture that tells its number by its brightness."""
+    """A picture with its number as its brightness."""
     return np.full((48, 64, 3), 4 * number, np.uint8)
 
 

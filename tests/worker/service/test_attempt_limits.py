@@ -1,4 +1,4 @@
-"""Proves that an attempt that runs too long or uses too much memory ends, by name and once, and its worker goes on.
+"""Proves that an attempt that runs too long or uses too much memory ends, by name and once, and its worker continues.
 
 The processes are real. Control groups are read from files made here: making real ones needs rights that tests lack.
 """

@@ -1,4 +1,4 @@
-"""Proves that an attempt stops before the worker's disk is full and goes on later, and that a worker waits for space.
+"""Proves that an attempt stops before the worker's disk is full and continues later, and that a worker waits for space.
 
 The free space is played, or the reserve is larger than any disk; no disk is filled here.
 """
@@ -97,7 +97,7 @@ def test_an_attempt_stops_at_the_reserve_and_a_restart_goes_on(
     assert job.state == "failed"
     assert job.problem is not None
     assert job.problem.code == "worker_disk_full"
-    assert "goes on from its last checkpoint" in str(job.problem.advice)
+    assert "continues from its last checkpoint" in str(job.problem.advice)
     stopped_at = json.loads(checkpoint.read_text())["step"]
     assert 5 <= stopped_at < 60
     connection.hset(keys.job(JOB), "generation", "2")

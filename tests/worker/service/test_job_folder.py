@@ -87,7 +87,7 @@ def test_files_come_from_a_bucket_several_at_a_time_and_their_number_is_told(
     s3.seen.clear()
     folder.stage_capture()
     assert [seen.path for seen in s3.seen if "/files/images/" in seen.path] == [], (
-        "what is there is not fetched"
+        "files that are present are not fetched"
     )
 
 

@@ -1,4 +1,4 @@
-"""A real Redis that answers and refuses writes: a job goes on, all its events arrive, and none is requeued beside it.
+"""A real Redis that answers and refuses writes: a job continues, all its events arrive, and none is requeued beside it.
 
 Does not prove what happens while Redis is away: tests/worker/service/attempts/test_outbox.py and tests/service do.
 """

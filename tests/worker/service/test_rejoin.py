@@ -1,6 +1,6 @@
 """Proves that a lease is taken again from a Redis that has lost its data, and from no worker and no line.
 
-Does not prove that a running attempt goes on: tests/service/test_kills does.
+Does not prove that a running attempt continues: tests/service/test_kills does.
 """
 
 from typing import Any

@@ -143,7 +143,7 @@ def room(image: Image.Image) -> Iterator[None]:
 def several(image: Image.Image) -> bool:
     """Whether the file holds more than one picture, such as an animation or the pages of a TIFF."""
     if image.format != "TIFF":
-        # A JPEG's further pictures are previews and gain maps, which its format, MPO, tells apart from its photo.
+        # A JPEG's further pictures are previews and gain maps, which its format, MPO, distinguishes from its photo.
         return image.format != "MPO" and int(getattr(image, "n_frames", 1)) > 1
     # Counting the pages would read each of them, and a file can chain millions.
     try:

@@ -217,7 +217,7 @@ class RenderApp:
         left.
 
         The model is not held between two turns, so that all models keep to the bytes of the cache. A turn that had to
-        read it goes on for as long as that took: videos of models that do not fit together would else read them anew
+        read it continues for as long as that took: videos of models that do not fit together would else read them anew
         for each frame.
         """
         from splatmill_worker.film import Film

@@ -113,7 +113,7 @@ def main(model: Path, out: Path, wanted: Wanted) -> int:
 
 
 def clean_file(model: Path, out: Path, wanted: Wanted) -> Cleaned:
-    """Write what cleaning leaves of the model in `model` to `out`, whose suffix tells the format.
+    """Write what cleaning leaves of the model in `model` to `out`, whose suffix names the format.
 
     Photos that cameras.json beside the model names as held out decide nothing; without a cameras.json, they are chosen
     as for a training. Raises ModelUnreadable, Refusal where the photos or cameras cannot be used or nothing would be

@@ -37,7 +37,7 @@ _SWING_RISE = 0.15
 class OrbitPath:
     """A closed camera path around a target.
 
-    target: the point that the camera looks at, [3], in world units.
+    target: the point that the camera faces, [3], in world units.
     right, front, up: orthonormal axes, [3] each; azimuths are measured from `right` towards `front`.
     radius: distance from the vertical axis through the target, in world units.
     height: height above the target along `up`, in world units.

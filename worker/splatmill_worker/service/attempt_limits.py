@@ -14,7 +14,7 @@ OOM_SCORE = 500
 out of memory, the kernel kills these first, unless the attempt has more than half of it, and the attempt before Redis,
 the API and the worker itself, whose score is 0."""
 
-_MEMORY_SECONDS = 0.5  # between two looks at the memory in use
+_MEMORY_SECONDS = 0.5  # between two readings of the memory in use
 
 
 @dataclass(frozen=True)

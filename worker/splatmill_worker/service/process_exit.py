@@ -12,7 +12,7 @@ HANDED_BACK_STATUS = 75
 """Exit status (EX_TEMPFAIL) of an attempt that saved its state because the worker is stopping."""
 
 UNREPORTED_STATUS = 76
-"""Exit status of an attempt that gave up waiting for Redis. Its files are kept, so that the next attempt goes on."""
+"""Exit status of an attempt that gave up waiting for Redis. Its files are kept, so that the next attempt continues."""
 
 WITHDRAWN_STATUS = 77
 """Exit status of an attempt that ended before it began, because its job was cancelled meanwhile."""

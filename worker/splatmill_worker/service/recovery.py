@@ -86,7 +86,7 @@ def requeue_orphans(worker: Worker) -> None:
 def _dead_workers(connection: redis.Redis, worker_keys: Sequence[str]) -> list[str]:
     """Return those of the registered workers that are certainly dead, or silent until their records expired.
 
-    It takes two round trips, because a worker that starts looks at all others.
+    It takes two round trips, because a worker that starts reads all others.
     """
     with connection.pipeline(transaction=False) as pipe:
         for key in worker_keys:

@@ -9,7 +9,7 @@ import redis
 
 PATIENCE = float(os.environ.get("SPLATMILL_REDIS_PATIENCE") or 600.0)
 """Seconds. An attempt computes on without Redis for as long as it has work. Where it needs Redis, at its start and its
-end, it waits this long; then its process ends, and the job goes on from its last checkpoint when Redis works again."""
+end, it waits this long. Then its process ends; the job continues from its last checkpoint when Redis works again."""
 
 RETRY_SECONDS = 0.5
 

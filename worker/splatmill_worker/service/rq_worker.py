@@ -60,7 +60,7 @@ AttemptEnd = Literal["reported", "stopped", "handed_back", "limited", "crashed",
 """How an attempt ended, as it is counted (`totals.ATTEMPTS`)."""
 
 _RETRY_SECONDS = 0.5
-_SPACE_SECONDS = 1.0  # between two looks at a disk that is full
+_SPACE_SECONDS = 1.0  # between two checks of a disk that is full
 _LOG_SECONDS = 30.0  # between two log lines about a Redis that does not work
 _REMOVAL_INTERVAL = 300.0  # half as long as Redis knows that a job was deleted
 _IDLE_SECONDS = 5.0
@@ -244,7 +244,7 @@ class AttemptWorker(Worker):
         if not leases.rejoin(self.connection, self._lease, self.name, job.to_dict(include_meta=False)):
             return False
         self.log.warning(
-            "Worker %s: Redis has lost its data; the attempt at job %s goes on", self.name, job.id
+            "Worker %s: Redis has lost its data; the attempt at job %s continues", self.name, job.id
         )
         return True
 
@@ -462,7 +462,7 @@ class AttemptWorker(Worker):
         if process_exit.clean:
             if self.connection.hget(job.key, "status") != JobStatus.FINISHED.value.encode():
                 return "reported"  # a transient failure, which waits again
-            lines.took(self.connection, self._line, time.monotonic() - self._began)
+            lines.record_duration(self.connection, self._line, time.monotonic() - self._began)
             return "reported"
         if self._superseded or not Job.exists(job.id, self.connection):
             return "superseded"

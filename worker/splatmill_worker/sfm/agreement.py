@@ -51,7 +51,7 @@ class Poses:
 def agreement(poses: Poses, result: EffortResult, database: pycolmap.Database, pair: Pair) -> float:
     """Share of the pair's inliers that fit the epipolar geometry of the model's two cameras.
 
-    A match fits where its Sampson error is at most that which verification allows: Hartley and Zisserman, "Multiple
+    A match fits where its Sampson error is at most the bound of verification: Hartley and Zisserman, "Multiple
     View Geometry in Computer Vision", second edition, section 11.4.3. Both photos must be registered.
     """
     first, second = pair

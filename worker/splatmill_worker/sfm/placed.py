@@ -27,7 +27,7 @@ class Placed:
 
 
 class PlacingObserver(Protocol):
-    """Looks at a mapping at moments of its own choice, while the mapper waits."""
+    """Observes a mapping at moments of its own choice, while the mapper waits."""
 
     def is_due(self) -> bool:
         """Whether to look at the mapping now."""

@@ -74,7 +74,7 @@ class SfmRun:
     threads: number of CPU threads.
     pool: with that many threads.
     on_progress, cancelled: the caller's callbacks.
-    observer: looks at the mapping; None: nobody does.
+    observer: called with the mapping while it grows, or None.
     scores: number of preemptive matches of each candidate pair; empty until some effort needs them.
     seconds: time spent so far, by stage.
     notes: sentences for the user.

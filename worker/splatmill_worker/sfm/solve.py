@@ -51,7 +51,7 @@ def reconstruct(
     on_progress: called with the stages images, features, pairs, matching, mapping and, where points are few, stereo.
     cancelled: polled; Cancelled is raised within a fraction of a second of it turning true, except that the global
         mapper and a bundle adjustment that are running finish first.
-    observer: looks at the cameras and points while the incremental mapper places them.
+    observer: called with the cameras and points while the incremental mapper places them.
     known: a distance between two photos, which makes the metre the unit of the scene.
 
     Raises SfmFailed with facts and advice when no usable model is found, Refusal for a distance between photos that

@@ -13,7 +13,7 @@ SPARED = 8
 """Every n-th photo, in order of name, keeps its exposure: these are the photos that are held out by default."""
 
 SURROUNDINGS = 0.15
-"""Radius of the surroundings that local tone mapping looks at, over the photo's longer side."""
+"""Radius of the surroundings of local tone mapping, over the photo's longer side."""
 
 
 @dataclass(frozen=True)

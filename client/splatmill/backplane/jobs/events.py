@@ -161,18 +161,18 @@ def decode(entries: Entries, stream: str) -> list[StoredEvent]:
 
     An entry that this version cannot read, such as an event of an unknown type, is left out and logged.
     """
-    found = []
+    decoded = []
     for entry_id, fields in entries:
         name = f"entry {entry_id.decode()} of {stream}"
         try:
             event, left_out = _event(fields)
-            found.append(StoredEvent(entry_id.decode(), int(fields[b"g"]), int(fields[b"a"]), event))
+            decoded.append(StoredEvent(entry_id.decode(), int(fields[b"g"]), int(fields[b"a"]), event))
         except (KeyError, ValueError, TypeError, AttributeError) as error:
             warn(name, f"skipped, because it cannot be read: {reason(error)}")
         else:
             if left_out:
                 warn(name, f"left out what this version cannot read: {'; '.join(left_out)[:300]}")
-    return found
+    return decoded
 
 
 def _event(fields: Mapping[bytes, bytes]) -> tuple[Event, list[str]]:
@@ -195,8 +195,8 @@ def read_progress(connection: redis.Redis, job_id: str) -> list[StoredEvent]:
 
 def read_log(connection: redis.Redis, job_id: str) -> list[StoredEvent]:
     """Return the log lines of all attempts at a job that were not trimmed, oldest first."""
-    found = _read(connection, job_id, keys.log, keys.warnings)
-    return [stored for stored in found if isinstance(stored.event, LogEvent)]
+    stored_events = _read(connection, job_id, keys.log, keys.warnings)
+    return [stored for stored in stored_events if isinstance(stored.event, LogEvent)]
 
 
 def read_curve(connection: redis.Redis, job_id: str) -> list[CurveRow]:
@@ -238,8 +238,8 @@ def _read(connection: redis.Redis, job_id: str, *streams: Callable[[str], str]) 
         for stream in streams:
             pipe.xrange(stream(job_id))
         replies = pipe.execute()
-    found = [decode(reply, stream(job_id)) for stream, reply in zip(streams, replies, strict=True)]
-    return list(heapq.merge(*found, key=time_order))  # keeps the order within each
+    decoded = [decode(reply, stream(job_id)) for stream, reply in zip(streams, replies, strict=True)]
+    return list(heapq.merge(*decoded, key=time_order))  # keeps the order within each
 
 
 def last_progress(connection: redis.Redis, job_id: str) -> StoredEvent | None:
@@ -266,8 +266,8 @@ def newest_entry(entry_id: str, generation: int, attempt: int, event: Event) -> 
 def last_preview(connection: redis.Redis, job_id: str) -> PreviewEvent | None:
     """Return the newest `PreviewEvent` of a job, or None if its worker noted none."""
     stored = cast(bytes | None, connection.hget(keys.latest(job_id), LATEST[PreviewEvent]))
-    found = _latest(stored, job_id) if stored is not None else None
-    return found.event if found is not None and isinstance(found.event, PreviewEvent) else None
+    newest = _latest(stored, job_id) if stored is not None else None
+    return newest.event if newest is not None and isinstance(newest.event, PreviewEvent) else None
 
 
 def _latest(stored: bytes, job_id: str) -> StoredEvent | None:

@@ -96,8 +96,8 @@ def read(connection: redis.Redis, job_id: str) -> JobRow | None:
 
 def request_of(connection: redis.Redis, job_id: str) -> str | None:
     """Return the id of the request that began the job's generation, or None if it is not known."""
-    found = cast(bytes | None, connection.hget(keys.job(job_id), "request"))
-    return found.decode("utf-8", "replace") if found else None
+    request = cast(bytes | None, connection.hget(keys.job(job_id), "request"))
+    return request.decode("utf-8", "replace") if request else None
 
 
 def now() -> datetime:

@@ -245,13 +245,13 @@ class Reclaim:
         if not self._trusted():
             return []
         members = cast(list[bytes], self._connection.eval(_EXPIRED, 1, rq_keys.STARTED, LEASE))
-        found: list[tuple[Lease, Requeued]] = []
+        reclaimed: list[tuple[Lease, Requeued]] = []
         for lease in _leases(self._connection, members):
             became = requeue(self._connection, lease, if_expired=True)
             if became != "kept":
                 log.warning("the worker of %s was lost; the entry is now %s", lease.entry, became)
-                found.append((lease, became))
-        return found
+                reclaimed.append((lease, became))
+        return reclaimed
 
     def _trusted(self) -> bool:
         """Return whether Redis has been there for so long that every living worker has prolonged its lease."""
@@ -275,7 +275,7 @@ class Reclaim:
 
 
 def _leases(connection: redis.Redis, members: list[bytes]) -> list[Lease]:
-    found = []
+    readable = []
     for member in members:
         entry, _, execution = member.decode("utf-8", "replace").rpartition(":")
         try:
@@ -286,5 +286,5 @@ def _leases(connection: redis.Redis, members: list[bytes]) -> list[Lease]:
                     "removed %r from the leases, because it is not '<job>-<generation>:<execution>'", member
                 )
         else:
-            found.append(Lease(entry, execution))
-    return found
+            readable.append(Lease(entry, execution))
+    return readable

@@ -124,18 +124,18 @@ def answered(reply: list[Any]) -> Waiting:
 
 
 def _waiting(answer: list[Any]) -> Waiting:
-    _, lengths, found = answer
+    _, lengths, places = answer
     return Waiting(
         {owner.decode(): dict(zip(LINES, counts, strict=True)) for owner, counts in lengths},
         {
             entry.decode(): Place(line.decode(), owner.decode(), dict(zip(LINES, before, strict=True)))
-            for entry, line, owner, before in found
+            for entry, line, owner, before in places
         },
     )
 
 
-def took(connection: redis.Redis, line: Line, seconds: float) -> None:
-    """Record how long an attempt took that ended its job."""
+def record_duration(connection: redis.Redis, line: Line, seconds: float) -> None:
+    """Record the seconds of an attempt that ended its job."""
     with connection.pipeline() as pipe:
         pipe.lpush(keys.durations(line), round(seconds, 1))
         pipe.ltrim(keys.durations(line), 0, _KEPT_DURATIONS - 1)

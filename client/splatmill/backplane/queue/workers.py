@@ -60,10 +60,10 @@ def recorded(connection: redis.Redis, names: Iterable[bytes]) -> list[WorkerReco
         for worker_key in known:
             pipe.hmget(worker_key, *_FIELDS)
         replies = cast(list[list[bytes | None]], pipe.execute())
-    found = zip(known, (dict(zip(_FIELDS, reply, strict=True)) for reply in replies), strict=True)
+    records = zip(known, (dict(zip(_FIELDS, reply, strict=True)) for reply in replies), strict=True)
     return [
         _record(worker_key.decode(), {name: value for name, value in stored.items() if value is not None})
-        for worker_key, stored in found
+        for worker_key, stored in records
         if stored["death"] is None and any(value is not None for value in stored.values())
     ]
 

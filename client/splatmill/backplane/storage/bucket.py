@@ -83,7 +83,7 @@ class Resumption:
     obstore repeats a reading itself, but only until a fixed time after its first request, which a long download or a
     slow reader exceeds. Here every byte that comes makes the count of repetitions begin anew.
 
-    version: of the file to read, as storage names it; None for that which the first request finds.
+    version: of the file to read, as storage names it; None for the one that the first request returns.
     """
 
     def __init__(self, start: int, end: int | None, retries: int, version: str | None = None) -> None:
@@ -109,7 +109,7 @@ class Resumption:
         self._etag = meta["e_tag"]
         self._end = meta["size"] if self._end is None else min(self._end, meta["size"])
 
-    def took(self, count: int) -> None:
+    def received(self, count: int) -> None:
         """Note that `count` bytes more have come."""
         self.position += count
         self._failures = 0

@@ -86,8 +86,8 @@ def folder_of(path: str) -> tuple[str, str, str] | None:
     """Return the kind of the folder that holds a path ("captures", "jobs" or "models"), the id in its name and the
     rest of the path, or None for a path of another kind."""
     kind, _, rest = path.partition("/")
-    found, _, inside = rest.partition("/")
-    return (kind, found, inside) if kind in ("captures", "jobs", "models") and is_id(found) else None
+    record_id, _, inside = rest.partition("/")
+    return (kind, record_id, inside) if kind in ("captures", "jobs", "models") and is_id(record_id) else None
 
 
 def is_derived(kind: str, inside: str) -> bool:

@@ -24,9 +24,9 @@ class UnreadableRecord(ValueError):
 
 def check_format(record: Mapping[str, Any]) -> None:
     """Raise ValueError if a record has a later format than this version reads."""
-    found = int(record.get("format", FORMAT))
-    if found > FORMAT:
-        raise ValueError(f"it has format {found}, and this version reads formats up to {FORMAT}")
+    version = int(record.get("format", FORMAT))
+    if version > FORMAT:
+        raise ValueError(f"it has format {version}, and this version reads formats up to {FORMAT}")
 
 
 def reason(error: Exception) -> str:

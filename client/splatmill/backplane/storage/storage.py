@@ -217,9 +217,9 @@ class Storage:
         self, path: str, start: int = 0, end: int | None = None, version: str | None = None
     ) -> AsyncIterator[bytes]:
         """Yield the bytes [start, end) in pieces of about CHUNK. Raises FileNotFoundError before the first piece, and
-        StorageChangedError where the file is no longer of the `version` that an Entry tells.
+        StorageChangedError where the file is no longer of the `version` in its Entry.
 
-        A reading that breaks off goes on behind the last piece, as long as it makes progress. A reader that is slow
+        A download that breaks off continues behind the last piece, as long as it makes progress. A reader that is slow
         delays nothing and holds a few pieces in memory.
         """
         reading = Resumption(start, end, self._patience.retries, version)
@@ -229,7 +229,7 @@ class Storage:
                     result = await obstore.get_async(self.bulk, path, options=reading.options())
                     reading.begun(result.meta)
                     async for chunk in result.stream(min_chunk_size=CHUNK):
-                        reading.took(len(chunk))
+                        reading.received(len(chunk))
                         yield bytes(chunk)
                 return
             except StorageError as error:
@@ -246,8 +246,8 @@ class Storage:
     def entries(self, prefix: str) -> Iterator[Entry]:
         """Yield all files under the folder `prefix`, sorted by path."""
         with self._operation("list", prefix):
-            found = [_entry(meta) for page in obstore.list(self.store, prefix) for meta in page]
-        yield from sorted(found, key=lambda entry: entry.path)
+            entries = [_entry(meta) for page in obstore.list(self.store, prefix) for meta in page]
+        yield from sorted(entries, key=lambda entry: entry.path)
 
     def walk(self, prefix: str) -> Iterator[Entry]:
         """Yield all files under the folder `prefix` in any order, page by page, without holding all in memory."""
@@ -333,7 +333,7 @@ class Storage:
     def download(self, path: str, target: Path) -> None:
         """Copy a stored file to a local path, atomically. Raises FileNotFoundError.
 
-        It goes on after a break, as `stream_get` does.
+        It continues after a break, as `stream_get` does.
         """
         reading = Resumption(0, None, self._patience.retries)
         with replacing(target) as part, part.open("wb") as file:
@@ -344,7 +344,7 @@ class Storage:
                         reading.begun(result.meta)
                         for chunk in result.stream(min_chunk_size=CHUNK):
                             file.write(chunk)
-                            reading.took(len(chunk))
+                            reading.received(len(chunk))
                     return
                 except StorageError as error:
                     pause = reading.pause(error)

@@ -64,26 +64,26 @@ def clean(
     if capture is not None and not capture.is_dir():
         raise typer.BadParameter(f"There is no folder {capture}.", param_hint="--capture")
     for path, hint in ((model, "MODEL"), (out, "--out")):
-        found = format_of(path.name)
+        model_format = format_of(path.name)
         usable = {
             s for s, form in MODEL_FORMATS.items() if (form.readable if path is model else form.writable)
         }
-        if found is None or found.suffix not in usable:
+        if model_format is None or model_format.suffix not in usable:
             raise typer.BadParameter(
                 f"{path} must end in one of {', '.join(sorted(usable))}.", param_hint=hint
             )
-    given: list[str] = []
+    arguments: list[str] = []
     if box is not None:
         try:
             edit = EditModel.model_validate({"box": {"min": box[:3], "max": box[3:]}})
         except ValidationError as error:
             raise invalid_request(error, "option_out_of_range") from error
-        given += ["--edit", edit.model_dump_json(exclude_none=True)]
+        arguments += ["--edit", edit.model_dump_json(exclude_none=True)]
     if capture is not None:
-        given += ["--capture", str(capture)]
+        arguments += ["--capture", str(capture)]
     if min_weight is not None:
-        given += ["--min-weight", repr(min_weight)]
+        arguments += ["--min-weight", repr(min_weight)]
     if image_size is not None:
-        given += ["--image-size", str(image_size)]
+        arguments += ["--image-size", str(image_size)]
     require("splatmill_worker", "Cleaning a model")
-    exec_module("splatmill_worker", "clean-file", "--out", str(out), *given, "--", str(model))
+    exec_module("splatmill_worker", "clean-file", "--out", str(out), *arguments, "--", str(model))

@@ -35,17 +35,17 @@ def convert(
 
     if not model.is_file():
         raise typer.BadParameter(f"There is no file {model}.", param_hint="MODEL")
-    found = format_of(model.name)
-    if found is None or not found.readable:
+    model_format = format_of(model.name)
+    if model_format is None or not model_format.readable:
         known = ", ".join(suffix for suffix, form in MODEL_FORMATS.items() if form.readable)
         raise typer.BadParameter(f"{model} must end in one of {known}.", param_hint="MODEL")
     for out in outs:
-        found = format_of(out.name)
-        if found is None or not found.writable:
+        model_format = format_of(out.name)
+        if model_format is None or not model_format.writable:
             known = ", ".join(suffix for suffix, form in MODEL_FORMATS.items() if form.writable)
             raise typer.BadParameter(f"{out} must end in one of {known}.", param_hint="OUT")
     if photos is not None and not photos.is_dir():
         raise typer.BadParameter(f"There is no folder {photos}.", param_hint="--photos")
     require("splatmill_worker", "Converting a model")
-    given = ("--photos", str(photos)) if photos is not None else ()
-    exec_module("splatmill_worker", "convert-file", *given, "--", str(model), *map(str, outs))
+    photo_arguments = ("--photos", str(photos)) if photos is not None else ()
+    exec_module("splatmill_worker", "convert-file", *photo_arguments, "--", str(model), *map(str, outs))

@@ -28,10 +28,10 @@ def delete(
     """
     with open_client(server) as client:
         # All are looked up before the first is deleted, so that a wrong id deletes nothing.
-        found = [_find(client, record_id) for record_id in dict.fromkeys(ids)]
+        records = [_find(client, record_id) for record_id in dict.fromkeys(ids)]
         if not yes:
-            _ask([description for description, _ in found])
-        for description, remove in found:
+            _ask([description for description, _ in records])
+        for description, remove in records:
             remove()
             typer.echo(f"Deleted {description}.")
 

@@ -28,7 +28,7 @@ def import_file(
 ) -> None:
     """Let the server fetch a photo, a video, a zip or a file of poses from an address; print the capture's id.
 
-    If this command is stopped, the server goes on with the import.
+    If this command is stopped, the server continues the import.
     """
     from splatmill.cli.display.progress import make_display
     from splatmill.errors import error_for

@@ -49,13 +49,13 @@ def jobs(
 ) -> None:
     """List the jobs, newest first."""
     with open_client(server) as client:
-        found = list(client.jobs(limit=limit, state=state, name=name, capture=capture, owner=owner))
+        listed = list(client.jobs(limit=limit, state=state, name=name, capture=capture, owner=owner))
     if as_json:
-        print_lines(found)
-    elif found:
+        print_lines(listed)
+    elif listed:
         rows = [
             (job.id, job.name or "", job.state.value, _brief_progress(job), local_time(job.created_at))
-            for job in found
+            for job in listed
         ]
         print_table(("job", "name", "state", "progress", "created"), rows)
     elif state or name or capture or owner:
@@ -78,7 +78,9 @@ def status(
     from splatmill.cli.display.plan import plan_lines
     from splatmill.schema import format_duration
 
-    took = (job.finished_at - job.started_at).total_seconds() if job.started_at and job.finished_at else None
+    duration = (
+        (job.finished_at - job.started_at).total_seconds() if job.started_at and job.finished_at else None
+    )
     facts = [
         ("job", job.id),
         ("name", job.name or ""),
@@ -88,7 +90,7 @@ def status(
         ("queue", _queue(job)),
         ("attempt", str(job.attempt)),
         ("created", job.created_at.astimezone().strftime("%Y-%m-%d %H:%M:%S")),
-        ("took", format_duration(took) if took is not None else ""),
+        ("took", format_duration(duration) if duration is not None else ""),
         ("progress", _progress(job)),
         ("problem", job.problem.sentence if job.problem else ""),
     ]

@@ -61,19 +61,19 @@ def list_keys(
 ) -> None:
     """List the keys, the oldest first, without their secrets."""
     with open_client(server) as client:
-        found = client.keys.list()
+        listed = client.keys.list()
     if as_json:
-        for key in found:
+        for key in listed:
             typer.echo(key.model_dump_json(exclude_none=True))
         return
-    if not found:
+    if not listed:
         typer.echo("There are no stored keys. Create one with: splatmill keys create NAME --scope admin")
         return
     from rich.console import Console
     from rich.table import Table
 
     table = Table("key", "name", "owner", "scopes", "limits", "created", box=None, pad_edge=False)
-    for key in found:
+    for key in listed:
         limits = ", ".join(
             f"{name.replace('_', ' ')} {value}" for name, value in key.limits if value is not None
         )

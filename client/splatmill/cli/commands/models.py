@@ -34,11 +34,11 @@ def download_files(model: "ModelHandle", folder: Path, names: Sequence[str] = ()
     """Download the files of the model with these names, or all of them, to `folder`, and return their paths."""
     folder.mkdir(parents=True, exist_ok=True)
     stored = {entry.name for entry in model.model.files}
-    wanted = [name for name in FILES if name in stored or not stored]
-    wanted += [name for name in OPTIONAL_FILES if name in stored]
+    chosen = [name for name in FILES if name in stored or not stored]
+    chosen += [name for name in OPTIONAL_FILES if name in stored]
     with make_transfer_display() as show:
         return [
-            model.download(folder / name, file=name, on_bytes=partial(show, name)) for name in names or wanted
+            model.download(folder / name, file=name, on_bytes=partial(show, name)) for name in names or chosen
         ]
 
 

@@ -174,14 +174,14 @@ def _camera(
             )
         chosen = cameras[int(camera)].camera
     elif view is not None:
-        found = [entry for entry in cameras if entry.name == view]
-        if not found:
+        named = [entry for entry in cameras if entry.name == view]
+        if not named:
             raise typer.BadParameter(
                 f"The model has no camera named {view!r}; it has "
                 f"{', '.join(c.name for c in cameras[:8])}, ...",
                 param_hint="--view",
             )
-        chosen = found[0].camera
+        chosen = named[0].camera
     else:
         chosen = next((entry for entry in cameras if entry.split == "test"), cameras[0]).camera
     return chosen.scaled_to(width) if width is not None else chosen

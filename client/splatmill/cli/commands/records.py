@@ -44,11 +44,11 @@ def captures(
         if capture_id is not None:
             _show_capture(client.capture(capture_id), as_json)
             return
-        found = list(client.captures(name=name, owner=owner, limit=limit))
+        listed = list(client.captures(name=name, owner=owner, limit=limit))
     if as_json:
-        print_lines(found)
-    elif found:
-        rows = [(entry.id, entry.name or "", local_time(entry.created_at)) for entry in found]
+        print_lines(listed)
+    elif listed:
+        rows = [(entry.id, entry.name or "", local_time(entry.created_at)) for entry in listed]
         print_table(("capture", "name", "created"), rows)
     else:
         typer.echo("No capture is stored." if name is owner is None else "No capture matches.")
@@ -71,10 +71,10 @@ def models(
         if model_id is not None:
             _show_model(client.model(model_id).model, as_json)
             return
-        found = list(client.models(name=name, owner=owner, limit=limit))
+        listed = list(client.models(name=name, owner=owner, limit=limit))
     if as_json:
-        print_lines(found)
-    elif found:
+        print_lines(listed)
+    elif listed:
         rows = [
             (
                 entry.id,
@@ -84,7 +84,7 @@ def models(
                 f"{entry.psnr:.2f} dB" if entry.psnr is not None else "",
                 local_time(entry.created_at),
             )
-            for entry in found
+            for entry in listed
         ]
         print_table(("model", "name", "Gaussians", "size", "PSNR", "created"), rows)
     else:

@@ -45,14 +45,14 @@ def list_shares(
 ) -> None:
     """List the links to a model, newest first, without their addresses."""
     with open_client(server) as client:
-        found = client.model(model_id).shares.list()
+        listed = client.model(model_id).shares.list()
     if as_json:
-        for share in found:
+        for share in listed:
             typer.echo(share.model_dump_json(exclude_none=True))
         return
-    if not found:
+    if not listed:
         typer.echo(f"There are no links to this model. Create one with: splatmill shares create {model_id}")
-    for share in found:
+    for share in listed:
         state = "revoked" if share.revoked_at else "valid until" if share.active else "expired"
         until = share.revoked_at or share.expires_at
         typer.echo(f"{share.id}  {state} {until:%Y-%m-%d %H:%M}" + (f"  {share.name}" if share.name else ""))

@@ -45,11 +45,11 @@ def _print_owners(console: object, use: "StorageUse") -> None:
     from splatmill.schema import format_bytes
 
     rows = []
-    for found in use.owners:
-        kinds = found.by_kind
-        sizes = (found.bytes, kinds.captures, kinds.sfm, kinds.jobs, kinds.models, kinds.uploads)
-        limit = "none" if found.limit is None else format_bytes(found.limit)
-        rows.append((found.owner or "(nobody)", *(format_bytes(size) for size in sizes), limit))
+    for owner_use in use.owners:
+        kinds = owner_use.by_kind
+        sizes = (owner_use.bytes, kinds.captures, kinds.sfm, kinds.jobs, kinds.models, kinds.uploads)
+        limit = "none" if owner_use.limit is None else format_bytes(owner_use.limit)
+        rows.append((owner_use.owner or "(nobody)", *(format_bytes(size) for size in sizes), limit))
     _print_table(
         console, ("owner", "total", "captures", "cameras", "jobs", "models", "uploads", "limit"), rows
     )
@@ -65,15 +65,15 @@ def _print_largest(console: object, use: "StorageUse") -> None:
     now = datetime.now(UTC)
     rows = [
         (
-            found.kind.value,
-            found.id,
-            found.name or "",
-            found.owner or "(nobody)",
-            format_bytes(found.bytes),
-            _ago(found.last_used, now),
-            _fate(found, now),
+            record.kind.value,
+            record.id,
+            record.name or "",
+            record.owner or "(nobody)",
+            format_bytes(record.bytes),
+            _ago(record.last_used, now),
+            _fate(record, now),
         )
-        for found in use.largest
+        for record in use.largest
     ]
     _print_table(console, ("kind", "id", "name", "owner", "size", "last used", "deleted"), rows)
 
@@ -84,8 +84,8 @@ def _print_deletions(console: object, use: "StorageUse") -> None:
     if not use.deletions:
         typer.echo("\nThe next sweep deletes nothing.")
         return
-    typer.echo(f"\nThe next sweep deletes {format_bytes(sum(found.bytes for found in use.deletions))}:")
-    rows = [(found.kind, found.id, format_bytes(found.bytes), found.reason) for found in use.deletions]
+    typer.echo(f"\nThe next sweep deletes {format_bytes(sum(record.bytes for record in use.deletions))}:")
+    rows = [(record.kind, record.id, format_bytes(record.bytes), record.reason) for record in use.deletions]
     _print_table(console, ("kind", "id", "size", "reason"), rows)
 
 
@@ -102,13 +102,13 @@ def _print_table(console: object, heads: tuple[str, ...], rows: Sequence[tuple[s
     console.print(table)
 
 
-def _fate(found: "StoredRecord", now: datetime) -> str:
+def _fate(record: "StoredRecord", now: datetime) -> str:
     """Return when a record is deleted by its age."""
-    if found.needed_by is not None:
-        return f"not before job {found.needed_by} ends"
-    if found.expires_at is None:
+    if record.needed_by is not None:
+        return f"not before job {record.needed_by} ends"
+    if record.expires_at is None:
         return "on request"
-    left = (found.expires_at - now).total_seconds()
+    left = (record.expires_at - now).total_seconds()
     return f"in {_span(left)}" if left > 0 else "by the next sweep"
 
 

@@ -92,20 +92,20 @@ def train(
     """Train Gaussian splats from photos; write model.ply and its report to DIR.
 
     Without a server, a training that is interrupted (Ctrl-C, kill, power cut) is kept in DIR/.splatmill, and the same
-    command goes on where it stopped.
+    command continues where it stopped.
     """
     from splatmill.sdk.aio import train_options, with_start_model
 
-    given = {key: value for key, value in options.items() if value is not None and value != []}
+    arguments = {key: value for key, value in options.items() if value is not None and value != []}
     if server is None:
         # The embedded service takes this training for a job like any other, but its results have no page.
-        given.setdefault("time_lapse", "off")
-    given, start = with_start_model(given, path)
-    checked = train_options(given)
-    found = find_files(path)
-    if found.is_one_photo:
+        arguments.setdefault("time_lapse", "off")
+    arguments, start = with_start_model(arguments, path)
+    checked = train_options(arguments)
+    capture_files = find_files(path)
+    if capture_files.is_one_photo:
         raise NothingToUpload(
-            f"{printable(found.files[0].name)} is one photo; depth cannot be recovered from a single photo.",
+            f"{printable(capture_files.files[0].name)} is one photo; depth cannot be recovered from a single photo.",
             "Give a folder with 20 or more photos from different places, a video, or a zip archive.",
         )
     if detach and server is None:
@@ -124,7 +124,7 @@ def train(
             param_hint="--priority",
         )
     out.mkdir(parents=True, exist_ok=True)
-    _announce(found)
+    _announce(capture_files)
     title = name or printable(path.expanduser().resolve().name)
 
     def outputs(model: ModelHandle) -> None:
@@ -137,7 +137,7 @@ def train(
 
     with _sigterm_as_interrupt():
         if server is None:
-            files = [*found.files, *([start_model(start)] if start is not None else [])]
+            files = [*capture_files.files, *([start_model(start)] if start is not None else [])]
             with _kept_service(out / DATA, path, files, checked, fresh) as (client, unfinished):
                 outputs(_train_here(client, unfinished, path, title, checked, start, verbose))
             return
@@ -153,19 +153,19 @@ def train(
             outputs(_follow(submit, verbose))
 
 
-def _announce(found: Found) -> None:
-    typer.echo(f"{', '.join(found.contents())}, {format_bytes(found.bytes)}")
-    if found.top:
-        typer.echo(f"cameras: those in {printable(found.top)}")
-    if found.ignored:
-        typer.echo(f"ignored: {listed([printable(name) for name in found.ignored])}")
-    if found.outputs:
+def _announce(files: Found) -> None:
+    typer.echo(f"{', '.join(files.contents())}, {format_bytes(files.bytes)}")
+    if files.top:
+        typer.echo(f"cameras: those in {printable(files.top)}")
+    if files.ignored:
+        typer.echo(f"ignored: {listed([printable(name) for name in files.ignored])}")
+    if files.outputs:
         typer.echo(
-            f"results of an earlier training, not read as photos: {listed([printable(name) for name in found.outputs])}"
+            f"results of an earlier training, not read as photos: {listed([printable(name) for name in files.outputs])}"
         )
-    for sentence in found.remarks:
+    for sentence in files.remarks:
         typer.echo(printable(sentence), err=True)
-    for name, stored in found.renamed:
+    for name, stored in files.renamed:
         typer.echo(f"renamed: {name!a} is stored as {stored}", err=True)
 
 
@@ -185,7 +185,7 @@ def _kept_service(
         except BaseException:
             if unfinished.trainings:
                 typer.echo(
-                    f"The training is kept in {data} ({size_text(data)}). The same command goes on where it "
+                    f"The training is kept in {data} ({size_text(data)}). The same command continues where it "
                     "stopped; other options use its cameras again; --fresh discards it and starts over.",
                     err=True,
                 )

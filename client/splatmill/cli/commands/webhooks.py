@@ -41,15 +41,15 @@ def create(
 def list_webhooks(server: ServerOption = None, as_json: AsJson = False) -> None:
     """List the webhooks, the oldest first, without their secrets."""
     with open_client(server) as client:
-        found = client.webhooks.list()
+        listed = client.webhooks.list()
     if as_json:
-        for webhook in found:
+        for webhook in listed:
             typer.echo(webhook.model_dump_json(exclude_none=True))
         return
-    if not found:
+    if not listed:
         typer.echo("There are no webhooks. Create one with: splatmill webhooks create URL")
         return
-    for webhook in found:
+    for webhook in listed:
         events = ", ".join(event.value.removeprefix("job.") for event in webhook.events)
         typer.echo(f"{webhook.id}  {webhook.url}  {events}" + (f"  {webhook.name}" if webhook.name else ""))
         if webhook.disabled_reason is not None:
@@ -83,8 +83,8 @@ def enable(webhook_id: WebhookId, server: ServerOption = None) -> None:
 def deliveries(webhook_id: WebhookId, server: ServerOption = None, as_json: AsJson = False) -> None:
     """List what was delivered, newest first, with every attempt."""
     with open_client(server) as client:
-        found = client.webhooks.deliveries(webhook_id)
-    for delivery in found:
+        deliveries = client.webhooks.deliveries(webhook_id)
+    for delivery in deliveries:
         if as_json:
             typer.echo(delivery.model_dump_json(exclude_none=True))
             continue

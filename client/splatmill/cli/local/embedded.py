@@ -36,7 +36,7 @@ class ServiceAddress:
 def embedded_service(data: Path, lock: int) -> Iterator[ServiceAddress]:
     """Run the service while the context is open, with its files in the folder `data`, which is kept.
 
-    A job that runs at the end saves its state, and goes on when the service is started on the same folder again.
+    A job that runs at the end saves its state, and continues when the service is started on the same folder again.
 
     lock: file descriptor of the folder's lock (`folder_lock`). The service inherits it, so that the folder stays locked
         until the service has ended, also when this process is killed.

@@ -73,8 +73,8 @@ def _take(path: Path, folder: Path) -> int:
 def _holder(descriptor: int) -> int | None:
     """Return the process that holds the lock, or None if it is unknown or on another machine."""
     try:
-        found = json.loads(os.pread(descriptor, 1000, 0))
-        return int(found["pid"]) if found["host"] == socket.gethostname() else None
+        holder = json.loads(os.pread(descriptor, 1000, 0))
+        return int(holder["pid"]) if holder["host"] == socket.gethostname() else None
     except (ValueError, KeyError, TypeError):
         return None
 

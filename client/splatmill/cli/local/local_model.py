@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 
 def is_local(model: str) -> bool:
     """Return whether a command is given the path of a model file, and not the id of a model. Ids have no suffix."""
-    found = format_of(model)
-    return found is not None and found.readable
+    model_format = format_of(model)
+    return model_format is not None and model_format.readable
 
 
 def local_cameras(model: Path) -> "list[ModelCamera]":
@@ -55,9 +55,9 @@ def render_local(
     from splatmill.errors import invalid_request
     from splatmill.schema import CameraSpec, RenderRequest
 
-    seen = camera or CameraSpec.looking_at((1, 0, 0), (0, 0, 0), width=16, height=16)
+    shown = camera or CameraSpec.looking_at((1, 0, 0), (0, 0, 0), width=16, height=16)
     try:
-        request = RenderRequest.model_validate({**options, "camera": seen})
+        request = RenderRequest.model_validate({**options, "camera": shown})
     except ValidationError as error:
         raise invalid_request(error, "camera_invalid") from error
     if camera is None:

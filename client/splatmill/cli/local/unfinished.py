@@ -74,7 +74,7 @@ class Unfinished:
         the photos at another path, or a record that cannot be read.
         """
         record = data / RECORD
-        wanted = cls(
+        requested = cls(
             data,
             str(path.expanduser().resolve()),
             _digests(files),
@@ -83,27 +83,27 @@ class Unfinished:
         if fresh or not record.is_file():
             shutil.rmtree(data, ignore_errors=True)
             data.mkdir(mode=0o700, parents=True, exist_ok=True)
-            return wanted
+            return requested
         try:
             stored = json.loads(record.read_text())
             if stored["format"] > FORMAT:
                 raise ValueError(f"it has format {stored['format']}, and this version reads {FORMAT}")
             path_before = str(stored["path"])
-            wanted.trainings = [Training(**entry) for entry in stored["trainings"]]
+            requested.trainings = [Training(**entry) for entry in stored["trainings"]]
         except (ValueError, KeyError, TypeError) as error:
             raise ServiceFailed(
                 f"The unfinished training in {data} cannot be read: {RECORD}: {error}.",
                 "Use the version of splatmill that wrote it, or discard the training with --fresh.",
             ) from error
-        if path_before != wanted.path:
+        if path_before != requested.path:
             raise ServiceFailed(
                 f"{data} holds an unfinished training of other photos, {path_before} ({size_text(data)}).",
                 "Choose another folder with -o, or discard that training with --fresh.",
             )
-        return wanted
+        return requested
 
     def stop_others(self, client: Client) -> None:
-        """Cancel the jobs of other files or options: the service goes on with them by itself when it starts."""
+        """Cancel the jobs of other files or options: else the service would continue them when it starts."""
         for training in self.trainings:
             if training is not self._same():
                 _end(client, training.job)
@@ -147,8 +147,8 @@ class Unfinished:
         atomic_write(self.data / RECORD, json.dumps(document, indent=1), sync=True)
 
     def _same(self) -> Training | None:
-        wanted = (self._files(), self.options)
-        return next((known for known in self.trainings if (known.files, known.options) == wanted), None)
+        requested = (self._files(), self.options)
+        return next((known for known in self.trainings if (known.files, known.options) == requested), None)
 
     def _files(self) -> str:
         lines = sorted(f"{role.value}/{name}\0{digest}" for (role, name), digest in self.digests.items())

@@ -113,8 +113,8 @@ MODEL_FORMATS: dict[str, ModelFormat] = {
 
 def is_model_file(name: str) -> bool:
     """Whether a name is that of a file from which a model can be read: of one that a training may start from."""
-    found = format_of(name)
-    return found is not None and found.readable and found.suffix.startswith(".")
+    model_format = format_of(name)
+    return model_format is not None and model_format.readable and model_format.suffix.startswith(".")
 
 
 def readable_suffixes() -> str:
@@ -126,8 +126,8 @@ def readable_suffixes() -> str:
 def format_of(name: str) -> ModelFormat | None:
     """The format of a file by its name: that of the longest suffix that fits, or None."""
     lower = name.lower()
-    found = [form for suffix, form in MODEL_FORMATS.items() if lower.endswith(suffix)]
-    return max(found, key=lambda form: len(form.suffix), default=None)
+    matches = [form for suffix, form in MODEL_FORMATS.items() if lower.endswith(suffix)]
+    return max(matches, key=lambda form: len(form.suffix), default=None)
 
 
 DOWNLOADS: dict[str, ModelFormat] = {form.key: form for form in MODEL_FORMATS.values() if form.writable}

@@ -40,14 +40,14 @@ def masks_beside(names: Collection[str]) -> set[str]:
     """Return those of the pictures `names` that are masks of others. One without a photo of its name is a photo."""
     known = {name.lower() for name in names} | {splitext(name)[0].lower() for name in names}
     whole = {name.lower() for name in names}
-    found = set()
+    masks = set()
     for name in names:
         stem, suffix = splitext(name)
         if suffix.lower() in MASK_SUFFIXES:
             forms = [form.lower() for form in _unmarked(stem)]
             if stem.lower() in whole or any(form in known for form in forms):
-                found.add(name)
-    return found
+                masks.add(name)
+    return masks
 
 
 def paired(photos: Collection[str], masks: Iterable[str]) -> dict[str, str]:

@@ -89,8 +89,11 @@ def unread_kind(name: str) -> UnreadKind | None:
 
 def unread(names: Iterable[str]) -> list[str]:
     """Return a sentence for each of UNREAD_KINDS that is among the files `names`."""
-    found: dict[UnreadKind, list[str]] = {}
+    names_by_kind: dict[UnreadKind, list[str]] = {}
     for name in names:
         if (kind := unread_kind(name)) is not None:
-            found.setdefault(kind, []).append(name)
-    return [f"Not read are {kind.what}: {listed(files, 1)}. {kind.advice}" for kind, files in found.items()]
+            names_by_kind.setdefault(kind, []).append(name)
+    return [
+        f"Not read are {kind.what}: {listed(files, 1)}. {kind.advice}"
+        for kind, files in names_by_kind.items()
+    ]

@@ -171,7 +171,7 @@ export function idOfPage() {
 const REOPEN_MS = 3000;
 
 /**
- * Follow the events of a job until it ends or `close` is called; the browser reconnects by itself and goes on where it was.
+ * Follow the events of a job until it ends or `close` is called; the browser reconnects by itself and continues where it was.
  *
  * Where the server answered with an error, which browsers take for the end, a new stream begins at the first event.
  * @param {string} jobId

@@ -1,5 +1,5 @@
 """Proves that down and the point that cameras look at are found from synthetic cameras with a known down: held level by
-unsteady hands, some of them rolled, from above, almost one way; and that what is in doubt is said.
+unsteady hands, some of them rolled, from above, almost one way; and that doubts are reported.
 
 Not proven here: how steady hands are.
 """

@@ -1,5 +1,5 @@
 """Proves that the variants of the `.ply` that other programs write are read with the right values, that what is read
-otherwise or left out is said, and that what has two readings is refused.
+otherwise or left out is reported, and that what has two readings is refused.
 
 Does not prove which programs write them.
 """

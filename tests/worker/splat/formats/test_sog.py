@@ -142,7 +142,7 @@ def test_damaged_archives_are_named(tmp_path: Path) -> None:
     data = (tmp_path / "m.sog").read_bytes()
     beyond_the_end = (
         data[:28] + b"\xff\xff" + data[30:]
-    )  # the first member's extra field is said to be that long
+    )  # the header gives the first member's extra field that length
     list_at = data.index(b"PK\x01\x02")
     encrypted = data[:6] + b"\x01" + data[7 : list_at + 8] + b"\x01" + data[list_at + 9 :]
     half, none, empty = data[: len(data) // 2], b"", b"PK\x05\x06" + b"\0" * 18

@@ -1,4 +1,4 @@
-"""Proves the decisions on photos: size, background, exposures, anti-aliasing, and what is said about lenses and masks.
+"""Proves the decisions on photos: size, background, exposures, anti-aliasing, and the remarks on lenses and masks.
 
 Does not prove that the thresholds are the best ones.
 """

@@ -1,4 +1,4 @@
-"""Proves that training which runs out of memory rolls back, goes on with fewer Gaussians, and warns of it.
+"""Proves that training which runs out of memory rolls back, continues with fewer Gaussians, and warns of it.
 
 The shortage is made by an engine that refuses to hold more than so many Gaussians. Does not prove that a real
 device's allocator reports a shortage.

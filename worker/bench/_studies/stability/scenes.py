@@ -180,7 +180,7 @@ def depths(ratio: float, seed: int) -> Scene:
 
 
 def off_axis(tangent: float, seed: int) -> Scene:
-    """The image looks at directions whose x/z is about `tangent`: the principal point is far to its left."""
+    """The image covers directions whose x/z is about `tangent`: the principal point is far to its left."""
     scene = cloud(seed=seed)
     points = scene.means @ scene.viewmat[:3, :3].T + scene.viewmat[:3, 3]
     points[:, 0] += tangent * points[:, 2]

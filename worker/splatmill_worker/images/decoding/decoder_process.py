@@ -37,7 +37,7 @@ PIPE_BYTES = 2**20
 photo."""
 
 POLL_MILLISECONDS = 200
-"""Longest wait for bytes of an answer between two looks at the deadline and at `Call.cancelled`."""
+"""Longest wait for bytes of an answer between two checks of the deadline and at `Call.cancelled`."""
 
 _KEPT = ("PATH", "LANG", "LC_ALL", "TZ", "LD_LIBRARY_PATH")
 """Environment variables that a decoding process is given."""

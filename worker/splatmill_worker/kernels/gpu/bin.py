@@ -102,7 +102,7 @@ def pairs_kernel(
 ):  # fmt: skip
     """Count the pairs of each splat or, with WRITE, write them: one kernel, so that both find the same pairs.
 
-    Pairs beyond `room` are not written. They are those of the farthest splats; the last of `ends` tells how many pairs
+    Pairs beyond `room` are not written. They are those of the farthest splats; the last of `ends` is how many pairs
     there are. `keys` are tile numbers, of 32 bits in images with too many tiles for 16.
     """
     slot = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)

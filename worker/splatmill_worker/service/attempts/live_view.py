@@ -66,7 +66,7 @@ class LiveView:
                     self._store(*pending)
                 self._there = bool(self._attempt.connection.exists(keys.watched(self._attempt.job_id)))
             except redis.RedisError:
-                self._there = False  # the outbox tells of the outage
+                self._there = False  # the outbox reports the outage
 
     def _store(self, ply: bytes, event: SnapshotEvent) -> None:
         key = keys.snapshot(self._attempt.job_id)

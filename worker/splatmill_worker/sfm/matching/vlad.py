@@ -1,4 +1,4 @@
-"""One global descriptor per photo, whose cosine similarity tells which photos may overlap.
+"""One global descriptor per photo, whose cosine similarity ranks which photos may overlap.
 
 VLAD (Jégou et al., "Aggregating local descriptors into a compact image representation", CVPR 2010): sums of the
 residuals of a photo's SIFT descriptors to the centres of a codebook, which is trained on the capture itself.

@@ -32,8 +32,8 @@ CONVENTIONS: dict[str, dict[str, Callable[[Float], npt.NDArray[Any]]]] = {
         "from camera to world with OpenGL axes": lambda given: FLIP @ np.linalg.inv(given),
     },
 }
-"""By what a file has, what else its matrices may be, and the world-to-camera matrix that they then mean, made of that
-which was read."""
+"""By what a file has: what else its matrices may be, and the function from the matrix that was read to the
+world-to-camera matrix that it then means."""
 
 CLEARLY = 2.0
 """Factor by which another convention must explain more matches than that of the file."""

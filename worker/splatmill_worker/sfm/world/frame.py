@@ -109,7 +109,7 @@ def require_photos(known: KnownDistance | None, names: Sequence[str]) -> None:
 
 
 def _down(scene: Scene, tags: Sequence[Exif]) -> Down:
-    """Down by the photos, or by GPS where that is in doubt and GPS tells."""
+    """Down by the photos, or by GPS where that is in doubt and GPS determines it."""
     down = down_of(np.array([view.camera.viewmat[:3, :3] for view in scene.views]))
     places = _places(tags)
     known = np.isfinite(places).all(axis=1)

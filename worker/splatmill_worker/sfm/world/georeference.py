@@ -19,7 +19,7 @@ BASELINE = 5.0
 then known to a fifth over the root of the number of photos."""
 
 TILT = 10.0
-"""The same across the direction of the largest spread, from which GPS tells down."""
+"""The same across the direction of the largest spread, from which GPS determines down."""
 
 AGREEING = 0.6
 """Share of the photos with GPS that must agree."""

@@ -76,7 +76,7 @@ def writer(path: Path) -> Writer:
 
 
 def read(path: Path) -> Contents:
-    """Read the model in a file of any readable format, which the suffix tells.
+    """Read the model in a file of any readable format, which the suffix names.
 
     Raises ModelUnreadable for a damaged file, what is no regular file, or an unknown suffix, and FileNotFoundError
     where there is no file.
@@ -88,7 +88,7 @@ def read(path: Path) -> Contents:
 
 
 def write(path: Path, gaussians: Gaussians, *, offset: Offset = NO_OFFSET, antialiased: bool = False) -> int:
-    """Write Gaussians to a file whose suffix tells the format, and return how many it holds.
+    """Write Gaussians to a file whose suffix names the format, and return how many it holds.
 
     gaussians: in the frame of the standard .ply, of any dtype and on any device.
     offset, antialiased: as in `Contents`, stored where the format has a place for them.

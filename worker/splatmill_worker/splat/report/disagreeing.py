@@ -38,7 +38,7 @@ class MarkedPhoto:
 
 
 def rows(trained: Trained) -> list[dict[str, Any]]:
-    """All training photos as plain values, that which disagrees most first."""
+    """All training photos as plain values, in order of decreasing disagreement."""
     return [
         {
             "photo": each.name,
@@ -51,7 +51,7 @@ def rows(trained: Trained) -> list[dict[str, Any]]:
 
 
 def named(trained: Trained) -> list[Disagreement]:
-    """The photos whose disagreement has a reason, that which disagrees most first; MOST_NAMED at most."""
+    """The photos whose disagreement has a reason, in order of decreasing disagreement; MOST_NAMED at most."""
     return [each for each in trained.disagreements if each.reason is not None][:MOST_NAMED]
 
 

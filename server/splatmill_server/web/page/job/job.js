@@ -218,7 +218,7 @@ function outcome() {
     return [box];
   }
   if (course.state === "failed") return [failure(course.problem ?? job.problem)];
-  if (course.state === "cancelled") return [noticeOf("The job is cancelled. Restarted, it goes on from its last checkpoint, if it has one.", "warning")];
+  if (course.state === "cancelled") return [noticeOf("The job is cancelled. A restart continues from its last checkpoint, if it has one.", "warning")];
   if (job.cancel_requested) return [noticeOf("The job is being cancelled: it ends once its process has ended.", "warning")];
   if (course.state === "queued") return [noticeOf(waiting())];
   return [];

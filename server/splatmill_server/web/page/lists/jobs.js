@@ -7,7 +7,7 @@ import { FINAL, RUNNING, badgeKind, badgeText } from "../job_states.js";
 import { listing } from "./listing.js";
 import { confirmAction, notify, startShell } from "../shell.js";
 
-const REFRESH_MS = 4000; // between two looks at the jobs that are not finished, while the page is seen
+const REFRESH_MS = 4000; // between two requests for the unfinished jobs, while the page is visible
 
 /** @param {any} job */
 function entry(job) {
@@ -60,7 +60,7 @@ function facts(job) {
 /** @param {any} job */
 async function cancel(job) {
   const yes = await confirmAction({
-    title: "Cancel this job?", text: "It ends without a model. What it has done is kept, so a restart goes on from there.", action: "Cancel the job",
+    title: "Cancel this job?", text: "It ends without a model. What it has done is kept, so a restart continues from there.", action: "Cancel the job",
   });
   if (!yes) return;
   list.update(await send("POST", `/v1/jobs/${job.id}/cancel`));

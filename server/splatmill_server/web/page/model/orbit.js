@@ -56,7 +56,7 @@ export async function showOrbit(section, { model, address, background }) {
       while (!stopping.signal.aborted && !["succeeded", "failed"].includes(orbit.state)) {
         bar.max = orbit.frames;
         bar.value = orbit.frames_done;
-        state.textContent = `${orbit.frames_done} of ${orbit.frames} frames are rendered. The server goes on if this page is closed.`;
+        state.textContent = `${orbit.frames_done} of ${orbit.frames} frames are rendered. The server continues if this page is closed.`;
         await new Promise((resolve) => setTimeout(resolve, LOOK_MS));
         if (!stopping.signal.aborted) orbit = await get(orbit.links.self, {}, stopping.signal);
       }

@@ -6,7 +6,7 @@ import { hasPhotosBeside, named } from "./documents.js";
 /** @typedef {"images" | "masks" | "poses"} Role */
 
 /**
- * What a server accepts, as `/v1/info` tells it.
+ * What a server accepts, from `/v1/info`.
  * @typedef {object} Accepted
  * @property {string[]} photos suffixes with their dot, in lower case
  * @property {string[]} videos

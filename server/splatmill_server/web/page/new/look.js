@@ -1,4 +1,4 @@
-// The worker that looks at one file at a time: digest, size, thumbnail and measures.
+// The worker that examines one file at a time: digest, size, thumbnail and measures.
 
 import { sha256 } from "./digest.js";
 import { MEASURED_SIDE, levels, measure } from "./measure.js";

@@ -300,7 +300,7 @@ async function offerToGoOn() {
   form.restore(upload.options);
   const box = h("div", { class: "notice", "data-kind": "warning", id: "go-on" },
     h("p", {}, `An upload was interrupted ${ago(upload.at)}: ${upload.name || "without a name"}, ${number(there)} of ${count(upload.files.length, "file")} arrived.`),
-    h("p", {}, "Give the same files again, and it goes on with those that are missing. Browsers do not keep files for a page."),
+    h("p", {}, "Choose the same files again; those that are missing are sent. Browsers do not keep files for a page."),
     h("button", { type: "button", class: "small", onclick: () => {
       start.withdraw();
       forget();

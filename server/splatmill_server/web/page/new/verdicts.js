@@ -1,4 +1,4 @@
-// What is said of each photo, from what was measured on all of them. A verdict is advice: nothing is left out by itself.
+// The verdict on each photo, from what was measured on all of them. A verdict is advice: nothing is left out by itself.
 
 import { distance } from "./measure.js";
 

@@ -9,7 +9,7 @@ import { noticeOf } from "../shell.js";
 export const address = at(`${pathOfPage().split("/").slice(0, 3).join("/")}/model`);
 
 /**
- * Show the model of this page's link in `#view`, or say there why that cannot be done. Returns what the link tells of it,
+ * Show the model of this page's link in `#view`, or say there why that cannot be done. Returns what the link answers of it,
  * or null where the link shows nothing any more.
  * @returns {Promise<any>}
  */

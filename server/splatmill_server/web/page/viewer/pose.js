@@ -89,7 +89,7 @@ export function tangentsOf(camera) {
 }
 
 /**
- * An upright pose at `eye` that looks at `target`.
+ * An upright pose at `eye` that faces `target`.
  * @param {Vec} eye @param {Vec} target @param {Vec} up
  * @returns {Pose}
  */

@@ -176,7 +176,7 @@ export class Splats {
 }
 
 /**
- * Load an asset of PlayCanvas. Of a .sog, the images are assets too, and PlayCanvas goes on without those that fail.
+ * Load an asset of PlayCanvas. Of a .sog, the images are assets too, and PlayCanvas continues without those that fail.
  * @param {any} assets @param {any} asset
  */
 async function loaded(assets, asset) {

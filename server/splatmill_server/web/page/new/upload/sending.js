@@ -9,7 +9,7 @@ const CONCURRENT = 4;
 /** Statuses after which the same request may succeed later; 0 is a broken connection. */
 const TRANSIENT = [0, 408, 425, 429, 500, 502, 503, 504];
 
-/** Codes of answers after which the upload of a file is begun again, and goes on where the server stands. */
+/** Codes of answers after which the upload of a file is begun again, and continues where the server stands. */
 const AGAIN = ["upload_offset_differs", "upload_completed", "upload_not_found", "body_cut_off", "digest_mismatch"];
 
 /** Codes that concern one file; the others are sent all the same. */
@@ -65,7 +65,7 @@ export class Sending {
 
   /**
    * Send what is missing; resolves once all files are stored or refused. Rejects with a Problem that ends the upload for
-   * now, and with an AbortError after `pause`; then it can be called again, and goes on.
+   * now, and with an AbortError after `pause`; then it can be called again, and continues.
    */
   async run() {
     this.control = new AbortController();

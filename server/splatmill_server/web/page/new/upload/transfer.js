@@ -1,4 +1,4 @@
-// One request that sends bytes, with progress. `fetch` tells nothing of the bytes sent, so this is an XMLHttpRequest.
+// One request that sends bytes, with progress. `fetch` does not report the bytes sent, so this is an XMLHttpRequest.
 
 import { at } from "../../address.js";
 import { Problem } from "../../api.js";
