@@ -15,7 +15,7 @@ from PIL import Image
 from playwright.sync_api import Browser
 
 from splatmill.schema import CameraSpec, ModelCamera, ModelCameras
-from splatmill_server.answers.single_file import single_file
+from splatmill_server.responses.single_file import single_file
 from splatmill_worker.render_service.encoding import camera_of
 from splatmill_worker.splat.formats import ply, sog
 from splatmill_worker.splat.render import render

@@ -1,6 +1,6 @@
 """Links to models over HTTP: what they open and for whom, how they end, and what the log and storage keep of the token.
 
-Not proved here: the pages of a link in a browser (tests/browser), renders of a real renderer (tests/server/answers).
+Not proved here: the pages of a link in a browser (tests/browser), renders of a real renderer (tests/server/responses).
 """
 
 from __future__ import annotations

@@ -264,7 +264,7 @@ LEFT: dict[str, Callable[[Ended], Any]] = {
     "leases": lambda e: e.redis.zadd(rq_keys.STARTED, {f"{entries.rq_id(e.job, 1)}:x": 9e9}),
     "waiting entries": lambda e: e.app.job(e.capture),
     "locks": lambda e: e.redis.hset(keys.lock(e.job), "token", "x"),
-    "marks of work in storage": lambda e: e.storage.put(layout.watched_job(e.job), b"{}"),
+    "marks of work in storage": lambda e: e.storage.put(layout.unfinished_job(e.job), b"{}"),
     "checkpoints in storage": lambda e: e.storage.put(f"{layout.job_work(e.job)}/plan.json", b"{}"),
 }
 

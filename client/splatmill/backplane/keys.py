@@ -24,7 +24,7 @@ LISTING = PREFIX + "listing"
 RESTORED = PREFIX + "restored"
 """Set of the jobs that were restored from storage and may still have a process that runs them. It expires."""
 
-WHOLE = PREFIX + "whole"
+UNSHRUNK = PREFIX + "whole"
 """Sorted set of ended jobs whose streams still hold all events, scored by the time in milliseconds from which their
 log, curve and progress are deleted. These are in storage by then. Only the server writes it."""
 
@@ -34,8 +34,8 @@ WRITABLE = PREFIX + "writable"
 TOTALS = PREFIX + "totals"
 """Hash of what is counted for the whole service (see `totals`), by field."""
 
-TIDIED = PREFIX + "queue:tidied"
-"""String that exists while no worker needs to tidy RQ's lists of entries and of workers, since one has. It expires."""
+REGISTRIES_CHECKED = PREFIX + "queue:tidied"
+"""String that exists after a worker has removed stale entries from the registries of RQ, until the next is due."""
 
 PLACES = PREFIX + "queue:places"
 """Hash of the waiting entries: entry to `<line>:<owner>`, the sorted set that holds it."""

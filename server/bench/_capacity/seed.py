@@ -74,7 +74,7 @@ def _store(storage: Storage, number: int, name: str, state: str) -> None:
     named = {"id": name, "capture": name, "name": f"job {number}", "owner": owner, "created_at": created}
     if state == "queued":
         row = JobRow(**named, options=TrainOptions(), queued_at=created)  # type: ignore[arg-type]  # typed by name
-        storage.put(layout.watched_job(name), row.model_dump_json(exclude_none=True).encode())
+        storage.put(layout.unfinished_job(name), row.model_dump_json(exclude_none=True).encode())
         return
     job = Job(
         **named,  # type: ignore[arg-type]  # typed by name

@@ -89,7 +89,7 @@ class Api:
     def shrink(self) -> None:
         """Shrink the streams of all jobs that have ended, as the reaper does after a minute."""
         redis = self.service.redis
-        for member in cast(list[bytes], redis.zrange(keys.WHOLE, 0, -1)):
+        for member in cast(list[bytes], redis.zrange(keys.UNSHRUNK, 0, -1)):
             shrinking.shrink(redis, member.decode())
 
     def look(self) -> dict[str, Any]:

@@ -20,7 +20,7 @@ Listed = Mapping[str, Sequence[str]]
 def remains(connection: redis.Redis, storage: Storage) -> dict[str, list[str]]:
     """Return what is still held of work, where no job is unfinished, by what it is. Raises UnreadableRecord."""
     waiting = lines.look(connection)
-    marks = [layout.watched_jobs(), layout.unfinished_imports(), layout.due_deliveries()]
+    marks = [layout.unfinished_jobs(), layout.unfinished_imports(), layout.due_deliveries()]
     found: dict[str, list[str]] = {
         "unfinished jobs": [job.decode() for job in cast(set[bytes], connection.smembers(keys.ACTIVE))],
         "leases": [lease.member for lease in leases.held(connection)],

@@ -1,6 +1,6 @@
-"""What all API processes tell alike when they are scraped: read from Redis in two round trips, whatever there is.
+"""Metrics shared by all API processes, read from Redis in two round trips.
 
-Nothing is remembered: without Redis there is no value, rather than an old one.
+None is cached: without Redis a metric has no value, rather than an old one.
 """
 
 from collections import Counter

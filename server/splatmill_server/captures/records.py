@@ -67,7 +67,7 @@ class Captures:
         self.settings = settings
         self.metrics = metrics
         self.unlisted = False
-        """Whether a capture was made, or may have been, and is not listed."""
+        """Whether a stored capture may be missing from the lists."""
         self.on_delete: list[Callable[[str], None]] = []
         """Called with the id of a capture once its record is deleted."""
         self.digests = Digests(storage)

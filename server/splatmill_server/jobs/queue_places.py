@@ -31,7 +31,7 @@ class QueuePlaces:
         self._fresh_until = float("-inf")
 
     def fill(self, jobs: Sequence[tuple[Job, int]]) -> list[Job]:
-        """Return the jobs, those that wait with their place in the queue.
+        """Return the jobs, with the places in the queue of those that wait.
 
         jobs: each with its generation.
 

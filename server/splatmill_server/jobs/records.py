@@ -111,7 +111,7 @@ class Jobs:
             # Of two concurrent requests with the same key, only one inserts the job.
             self.connection.transaction(insert, keys.job(job_id), keys.begun_jobs(owner), *watched)
         except BaseException:
-            self.storage.delete(layout.watched_job(job_id))
+            self.storage.delete(layout.unfinished_job(job_id))
             raise
         if known is not None:
             return self._placed(known), False
@@ -227,8 +227,8 @@ class Jobs:
     def retire(self, job_id: str) -> None:
         """Store the log of a job that has ended, announce its end, and remove it from the set of active ones.
 
-        It stays there if either cannot be stored, so that this is tried again, and if it was restarted meanwhile. The
-        request of a job whose row is lost is kept.
+        The job stays active if its log or its end cannot be stored, which is then tried again, or if it was restarted
+        meanwhile. The request of a job whose row is lost is kept.
         """
         try:
             if (known := row.read(self.connection, job_id)) is not None and (
@@ -375,7 +375,7 @@ class Jobs:
             for generation in range(1, found.generation + 1):
                 queue.forget(self.connection, job_id, generation)
         states = events.read_states(self.connection, job_id)
-        self.storage.delete(layout.watched_job(job_id))
+        self.storage.delete(layout.unfinished_job(job_id))
         # The record goes first, so that no model with missing files is visible.
         self.storage.delete(layout.job_record(job_id))
         self.storage.delete_prefix(layout.model(job_id))
@@ -388,7 +388,7 @@ class Jobs:
             if found is not None:  # it may have ended so lately that it still counts as unfinished
                 outcome.retire(pipe, found, states)
             pipe.srem(keys.ACTIVE, job_id)
-            pipe.zrem(keys.WHOLE, job_id)
+            pipe.zrem(keys.UNSHRUNK, job_id)
             pipe.execute()
 
     def _withdraw_unreadable(self, job_id: str) -> None:
@@ -462,7 +462,7 @@ class Jobs:
                 # The end of the former generation, if nobody has seen it yet.
                 outcome.retire(pipe, found, states)
                 pipe.sadd(keys.ACTIVE, job_id)
-                pipe.zrem(keys.WHOLE, job_id)
+                pipe.zrem(keys.UNSHRUNK, job_id)
                 created = lists.milliseconds(found.created_at)
                 lists.put_job(pipe, job_id, created, found.owner, found.capture, lists.UNFINISHED)
             if deleted:

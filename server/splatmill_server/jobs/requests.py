@@ -18,7 +18,7 @@ from splatmill.backplane.storage.storage import Storage
 
 def save(storage: Storage, begun: JobRow) -> None:
     """Store the row of a job that begins. Raises StorageError."""
-    storage.put(layout.watched_job(begun.id), begun.model_dump_json(exclude_none=True).encode())
+    storage.put(layout.unfinished_job(begun.id), begun.model_dump_json(exclude_none=True).encode())
 
 
 def next_generation(found: JobRow, moment: datetime, request: str | None) -> JobRow:
@@ -29,7 +29,7 @@ def next_generation(found: JobRow, moment: datetime, request: str | None) -> Job
 
 def get(storage: Storage, job_id: str) -> JobRow | None:
     """Return the row of an unfinished job, or None if there is none that can be read."""
-    path = layout.watched_job(job_id)
+    path = layout.unfinished_job(job_id)
     try:
         return JobRow.model_validate_json(storage.get(path))
     except FileNotFoundError:
@@ -41,14 +41,14 @@ def get(storage: Storage, job_id: str) -> JobRow | None:
 
 def list_ids(storage: Storage) -> list[str]:
     """Return the ids of all jobs whose rows are stored."""
-    paths = (entry.path.rpartition("/")[2] for entry in storage.walk(layout.watched_jobs()))
+    paths = (entry.path.rpartition("/")[2] for entry in storage.walk(layout.unfinished_jobs()))
     found = (path.removesuffix(".json") for path in paths if path.endswith(".json"))
     return sorted(job_id for job_id in found if layout.is_id(job_id))
 
 
 def delete(connection: redis.Redis, storage: Storage, ended: JobRow) -> None:
     """Delete the row of a job whose end is stored, unless it was restarted meanwhile."""
-    storage.delete(layout.watched_job(ended.id))
+    storage.delete(layout.unfinished_job(ended.id))
     try:
         found = row.read(connection, ended.id)
     except UnreadableRecord:

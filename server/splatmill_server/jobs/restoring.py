@@ -86,7 +86,7 @@ def _unfinished(storage: Storage, job_id: str) -> JobRow | None:
     found = requests.get(storage, job_id)
     ended = job_log.get_stored_end(storage, job_id) if found is not None else None
     if found is not None and ended is not None and ended.generation >= found.generation:
-        storage.delete(layout.watched_job(job_id))
+        storage.delete(layout.unfinished_job(job_id))
         return None
     return found
 

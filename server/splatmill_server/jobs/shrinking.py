@@ -28,13 +28,13 @@ _SHRUNK = (keys.progress, keys.log, keys.warnings, keys.curve)
 
 def note(pipe: Any, job_id: str, moment: float) -> None:
     """Note, in a transaction, that the streams of an ended job may be shrunk from a time in seconds on."""
-    pipe.zadd(keys.WHOLE, {job_id: int((moment + WHOLE_SECONDS) * 1000)})
+    pipe.zadd(keys.UNSHRUNK, {job_id: int((moment + WHOLE_SECONDS) * 1000)})
 
 
 def shrink_due(connection: redis.Redis) -> int:
     """Shrink the streams of the jobs whose time has come by the clock of Redis, and return the number of jobs."""
     now = connection.time()[0] * 1000
-    due = cast(list[bytes], connection.zrangebyscore(keys.WHOLE, "-inf", now, start=0, num=_MOST))
+    due = cast(list[bytes], connection.zrangebyscore(keys.UNSHRUNK, "-inf", now, start=0, num=_MOST))
     for member in due:
         shrink(connection, member.decode())
     return len(due)
@@ -53,7 +53,7 @@ def shrink(connection: redis.Redis, job_id: str) -> None:
         except UnreadableRecord:
             ended = False  # its streams stay until it is deleted
         pipe.multi()
-        pipe.zrem(keys.WHOLE, job_id)
+        pipe.zrem(keys.UNSHRUNK, job_id)
         if found is not None and ended:
             pipe.delete(*(stream(job_id) for stream in _SHRUNK))
             pipe.hset(keys.latest(job_id), keys.SHRUNK, 1)

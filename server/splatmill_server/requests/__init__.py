@@ -1,1 +1,1 @@
-"""What several endpoints are asked with: their parameters, ids with the check of their owner, and forms."""
+"""Requests that several endpoints share: their parameters, ids with the check of their owner, and forms."""

@@ -11,12 +11,12 @@ from starlette.responses import JSONResponse, Response
 from splatmill.backplane import rendering
 from splatmill.schema import EDIT_HEADER, Edited, EditModel
 from splatmill_server.access.caller import Who
-from splatmill_server.answers.forward import CLIENT_GONE, client_of, while_connected
 from splatmill_server.base.problems import ProblemError
 from splatmill_server.base.renderer import post
 from splatmill_server.edits import store_edited
 from splatmill_server.requests.ownership import ModelId
 from splatmill_server.requests.parameters import JSON_ONLY
+from splatmill_server.responses.forward import CLIENT_GONE, client_of, while_connected
 from splatmill_server.routes.models import RENDER_PROBLEMS
 from splatmill_server.routes.openapi import answer, problems
 from splatmill_server.service import Service, Shared

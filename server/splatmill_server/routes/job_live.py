@@ -11,9 +11,9 @@ from splatmill.backplane import keys
 from splatmill.backplane.storage import layout
 from splatmill.schema import SNAPSHOT_MEDIA_TYPE, Placement, Scope, Watch
 from splatmill_server.access.permission import needs
-from splatmill_server.answers.files import file_response, matches
 from splatmill_server.base.problems import ProblemError
 from splatmill_server.requests.ownership import JobId
+from splatmill_server.responses.files import file_response, matches
 from splatmill_server.routes.openapi import answer, binary, problems
 from splatmill_server.service import Shared
 

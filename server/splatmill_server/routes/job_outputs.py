@@ -13,12 +13,12 @@ from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.records import check_format
 from splatmill.schema import Curve, LogPage, Report
 from splatmill_server.access.caller import Who
-from splatmill_server.answers.files import file_response
-from splatmill_server.answers.sse import Follower, Position, event_stream, stored_stream
 from splatmill_server.base.problems import ProblemError
 from splatmill_server.jobs import curve as job_curve
 from splatmill_server.jobs import log as job_log
 from splatmill_server.requests.ownership import JobId
+from splatmill_server.responses.files import file_response
+from splatmill_server.responses.sse import Follower, Position, event_stream, stored_stream
 from splatmill_server.routes.openapi import answer, binary, problems
 from splatmill_server.service import Service, Shared
 

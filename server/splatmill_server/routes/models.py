@@ -20,13 +20,13 @@ from splatmill.schema import (
 )
 from splatmill_server.access.caller import Who
 from splatmill_server.access.permission import needs
-from splatmill_server.answers.forward import CLIENT_GONE, forward, while_connected
-from splatmill_server.answers.model_outputs import model_file, model_in_format, rendered_by_query
-from splatmill_server.answers.single_file import single_file
 from splatmill_server.base.filters import Filter
 from splatmill_server.base.paging import DEFAULT_LIMIT
 from splatmill_server.requests.ownership import ListedOwner, ModelId
 from splatmill_server.requests.parameters import JSON_ONLY, Cursor, Limit, NamePart
+from splatmill_server.responses.forward import CLIENT_GONE, forward, while_connected
+from splatmill_server.responses.model_outputs import model_file, model_in_format, rendered_by_query
+from splatmill_server.responses.single_file import single_file
 from splatmill_server.routes.openapi import CAMERA, RENDER_REQUESTS, answer, binary, problems
 from splatmill_server.service import Shared
 

@@ -8,9 +8,9 @@ from starlette.responses import Response
 
 from splatmill.schema import Orbit, OrbitList, OrbitRequest
 from splatmill_server.access.caller import Who
-from splatmill_server.answers.files import file_response
 from splatmill_server.requests.ownership import ModelId
 from splatmill_server.requests.parameters import JSON_ONLY
+from splatmill_server.responses.files import file_response
 from splatmill_server.routes.openapi import answer, binary, problems
 from splatmill_server.service import Shared
 

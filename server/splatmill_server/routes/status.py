@@ -49,9 +49,9 @@ from splatmill.schema import (
 from splatmill.schema.files.other_pictures import OTHER_FOLDERS, UNUSED
 from splatmill_server.access.caller import Caller, Who
 from splatmill_server.access.permission import needs
-from splatmill_server.answers.docs_page import CONTENT_SECURITY_POLICY, docs_page
 from splatmill_server.base import metrics, scrape
 from splatmill_server.base.problems import LOGGED
+from splatmill_server.responses.docs_page import CONTENT_SECURITY_POLICY, docs_page
 from splatmill_server.routes.openapi import answer, problems
 from splatmill_server.service import Service, Shared
 

@@ -28,7 +28,7 @@ from splatmill.schema import (
     ModelCameras,
 )
 from splatmill.sdk.client import Client
-from splatmill_server.answers.single_file import WEB
+from splatmill_server.responses.single_file import WEB
 from splatmill_worker.splat.formats import registry
 from tests.support.ball import write_ply
 from tests.support.command_line import invoke

@@ -137,15 +137,15 @@ def test_a_deleted_job_does_not_come_back(app: ServedApp) -> None:
 
 def test_a_job_that_ended_is_not_begun_again_where_its_request_was_left(app: ServedApp) -> None:
     job_id = app.job()
-    request = app.service.storage.get(layout.watched_job(job_id))
+    request = app.service.storage.get(layout.unfinished_job(job_id))
     app.begin(job_id)
     app.say(job_id, StateEvent(state=JobState.failed))
     app.service.reaper.tick()
-    assert not app.service.storage.exists(layout.watched_job(job_id))
-    app.service.storage.put(layout.watched_job(job_id), request)
+    assert not app.service.storage.exists(layout.unfinished_job(job_id))
+    app.service.storage.put(layout.unfinished_job(job_id), request)
     emptied(app)
     assert app.state(job_id) == "failed"
-    assert not app.service.storage.exists(layout.watched_job(job_id))
+    assert not app.service.storage.exists(layout.unfinished_job(job_id))
     # Its second generation has not ended.
     app.http.post(f"/v1/jobs/{job_id}/restart").raise_for_status()
     emptied(app)
@@ -183,7 +183,7 @@ def test_a_refused_job_leaves_no_request(app: ServedApp) -> None:
     asked = CreateJob(capture=app.capture())
     with pytest.raises(ProblemError, match="permits 0 at once"):
         app.service.admission.create(Caller("default", limits=KeyLimits(unfinished_jobs=0)), asked)
-    assert list(app.service.storage.walk(layout.watched_jobs())) == []
+    assert list(app.service.storage.walk(layout.unfinished_jobs())) == []
 
 
 def test_those_who_ask_while_lists_are_made_are_told_to_come_again(

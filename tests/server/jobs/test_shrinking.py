@@ -38,10 +38,10 @@ def bytes_of(connection: redis.Redis, job_id: str) -> int:
 def shrink(app: ServedApp, job_id: str) -> None:
     """The reaper sees the end of a job, and looks again when its time has come."""
     app.service.reaper.tick()
-    due = app.redis.zscore(keys.WHOLE, job_id)
+    due = app.redis.zscore(keys.UNSHRUNK, job_id)
     assert due is not None
     assert due / 1000 - app.redis.time()[0] > shrinking.WHOLE_SECONDS - 10
-    app.redis.zadd(keys.WHOLE, {job_id: 0})
+    app.redis.zadd(keys.UNSHRUNK, {job_id: 0})
     app.service.reaper.tick()
 
 
@@ -83,7 +83,7 @@ def test_an_ended_job_holds_little_and_answers_as_before(app: ServedApp, end: st
     assert bytes_of(app.redis, job_id) < LIMIT
     assert answers(app, job_id) == before
     assert len(app.http.get(f"/v1/jobs/{job_id}/curve").json()["rows"]) == 300
-    assert app.redis.zcard(keys.WHOLE) == 0
+    assert app.redis.zcard(keys.UNSHRUNK) == 0
 
 
 def test_those_who_follow_the_events_keep_their_place(app: ServedApp) -> None:

@@ -17,10 +17,10 @@ from starlette.datastructures import Headers
 
 from splatmill.schema.headers import read_retry_after
 from splatmill_server.access.browsers import check_origin
-from splatmill_server.answers.sse import Position
 from splatmill_server.base.outgoing import AddressRefused, Outgoing
 from splatmill_server.base.paging import read_cursor, write_cursor
 from splatmill_server.base.problems import ProblemError
+from splatmill_server.responses.sse import Position
 from splatmill_worker.errors import ModelUnreadable
 from splatmill_worker.splat.formats import registry
 from tests.support.gaussians import some_gaussians

@@ -67,6 +67,6 @@ def test_one_worker_cleans_the_lists_for_all(connection: redis.Redis) -> None:
     connection.sadd("rq:workers:train", "rq:worker:ghost")
     second.clean_registries()
     assert connection.sismember("rq:workers:train", "rq:worker:ghost"), "it was cleaned a moment ago"
-    connection.delete(keys.TIDIED)
+    connection.delete(keys.REGISTRIES_CHECKED)
     second.clean_registries()
     assert not connection.sismember("rq:workers:train", "rq:worker:ghost")

@@ -205,7 +205,7 @@ class AttemptWorker(Worker):
         second where there are a thousand.
         """
         self._reclaim.run()
-        if self.connection.set(keys.TIDIED, self.name, nx=True, ex=entries.MAINTENANCE_INTERVAL):
+        if self.connection.set(keys.REGISTRIES_CHECKED, self.name, nx=True, ex=entries.MAINTENANCE_INTERVAL):
             queue = self.queues[0]
             queue.finished_job_registry.cleanup()
             queue.failed_job_registry.cleanup()

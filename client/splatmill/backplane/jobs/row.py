@@ -15,7 +15,7 @@ from splatmill.schema.tolerant import keep_readable
 
 
 class Verdict(BaseModel):
-    """The end of a generation that the server decided, because no worker had ended it.
+    """Final state of a generation, set by the server when no worker reported one.
 
     state: cancelled, failed if the server gave the job up, or succeeded if its model is stored and no worker said so.
     at: time of the decision.

@@ -335,10 +335,11 @@ def due_delivery(seconds: int, webhook_id: str, delivery_id: str) -> str:
     return f"due/{seconds:012d}.{webhook_id}.{delivery_id}"
 
 
-def watched_jobs() -> str:
+def unfinished_jobs() -> str:
     """Return the folder of the rows of unfinished jobs."""
     return "watched"
 
 
-def watched_job(job_id: str) -> str:
+def unfinished_job(job_id: str) -> str:
+    """Return the path of the row of an unfinished job."""
     return f"watched/{job_id}.json"

@@ -92,7 +92,7 @@ def lost(connection: redis.Redis, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     """An attempt at an unfinished job that Redis has lost, and storage has not."""
     monkeypatch.setenv("SPLATMILL_STORAGE", (tmp_path / "storage").as_uri())
     monkeypatch.setattr(logging.getLogger("splatmill_worker"), "level", logging.WARNING)
-    Storage((tmp_path / "storage").as_uri()).put(layout.watched_job(JOB), b"{}")
+    Storage((tmp_path / "storage").as_uri()).put(layout.unfinished_job(JOB), b"{}")
     return start_attempt(connection, f"{JOB}-1", "token")
 
 
@@ -118,7 +118,7 @@ def test_a_job_that_is_not_restored_goes_back_to_the_queue(
 
 
 def test_a_job_that_was_deleted_does_not_begin(lost: Attempt, tmp_path: Path) -> None:
-    Storage((tmp_path / "storage").as_uri()).delete(layout.watched_job(JOB))
+    Storage((tmp_path / "storage").as_uri()).delete(layout.unfinished_job(JOB))
     run_attempt(lost, _pipeline, can_retry=False)
     assert lost.lock.holder() is None
 

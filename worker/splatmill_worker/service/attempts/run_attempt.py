@@ -157,7 +157,7 @@ def _restored_row(attempt: Attempt) -> JobRow | None:
     end = time.monotonic() + RESTORE_SECONDS
     try:
         storage = Storage(storage_url())
-        while storage.exists(layout.watched_job(attempt.job_id)):
+        while storage.exists(layout.unfinished_job(attempt.job_id)):
             if (row := rows.read(attempt.connection, attempt.job_id)) is not None:
                 return row
             if time.monotonic() > end or hand_back.requested():

@@ -10,9 +10,9 @@ from splatmill.backplane import rendering
 from splatmill.backplane.storage import layout
 from splatmill.schema import RenderRequest
 from splatmill_server.access.caller import Caller
-from splatmill_server.answers.files import file_response
-from splatmill_server.answers.forward import CLIENT_GONE, forward, while_connected
 from splatmill_server.background.conversions import format_of_key
+from splatmill_server.responses.files import file_response
+from splatmill_server.responses.forward import CLIENT_GONE, forward, while_connected
 from splatmill_server.service import Service
 
 

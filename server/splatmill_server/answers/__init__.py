@@ -1,1 +1,0 @@
-"""What several endpoints answer with: files in ranges, streams of events, the pictures of the renderer, a web page."""

@@ -1,0 +1,1 @@
+"""Responses that several endpoints share: files in ranges, event streams, rendered pictures, pages of the web."""
