@@ -75,6 +75,7 @@ def test_every_backend_has_the_same_stems(backend: str):
         ("splatmill_worker.service.rq_worker", {"torch", "pycolmap", "splatmill_server"}),
         # An attempt imports this before its first word; matplotlib would take a fifth of that time.
         ("splatmill_worker.pipeline", {"matplotlib", "triton"}),
+        ("splatmill_worker", {"torch", "numpy", "pycolmap", "redis", "pydantic"}),
         ("splatmill_worker.kernels", {"triton", "pycolmap", "redis", "splatmill"}),
         # The processes that decode photos import this: each attempt starts some, which know neither Redis nor messages.
         (

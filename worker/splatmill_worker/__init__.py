@@ -1,1 +1,79 @@
-"""The worker: the engine, the queue worker and the renderer."""
+"""The worker: the engine, the queue worker and the renderer. `import splatmill_worker as sm` offers the engine's names.
+
+A name is imported when it is first used, so that the programs of the worker start with what they need.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from splatmill_worker.images.load import load_views
+    from splatmill_worker.kernels import ops
+    from splatmill_worker.pipeline import run
+    from splatmill_worker.scene import Camera, Normalization, Scene, View, split
+    from splatmill_worker.sfm import SfmOptions, reconstruct
+    from splatmill_worker.splat.engine.open import open_engine
+    from splatmill_worker.splat.evaluate import evaluate
+    from splatmill_worker.splat.formats.registry import read, write
+    from splatmill_worker.splat.gaussians import Gaussians
+    from splatmill_worker.splat.plan.rates import Annealing, RateSchedule
+    from splatmill_worker.splat.render import render
+    from splatmill_worker.splat.start.points import from_points
+    from splatmill_worker.splat.views import TrainingView
+
+_MODULES = {
+    "Annealing": "splat.plan.rates",
+    "Camera": "scene",
+    "Gaussians": "splat.gaussians",
+    "Normalization": "scene",
+    "RateSchedule": "splat.plan.rates",
+    "Scene": "scene",
+    "SfmOptions": "sfm",
+    "TrainingView": "splat.views",
+    "View": "scene",
+    "evaluate": "splat.evaluate",
+    "from_points": "splat.start.points",
+    "load_views": "images.load",
+    "open_engine": "splat.engine.open",
+    "ops": "kernels",
+    "read": "splat.formats.registry",
+    "reconstruct": "sfm",
+    "render": "splat.render",
+    "run": "pipeline",
+    "split": "scene",
+    "write": "splat.formats.registry",
+}
+
+__all__ = [
+    "Annealing",
+    "Camera",
+    "Gaussians",
+    "Normalization",
+    "RateSchedule",
+    "Scene",
+    "SfmOptions",
+    "TrainingView",
+    "View",
+    "evaluate",
+    "from_points",
+    "load_views",
+    "open_engine",
+    "ops",
+    "read",
+    "reconstruct",
+    "render",
+    "run",
+    "split",
+    "write",
+]
+
+
+def __getattr__(name: str) -> Any:
+    module = _MODULES.get(name)
+    if module is None:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{module}"), name)
+
+
+def __dir__() -> list[str]:
+    return __all__
