@@ -55,18 +55,18 @@ class Server(uvicorn.Server):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Serve until a signal arrives. Return the exit status: 0, 1 if the start failed, 2 for invalid settings."""
-    given = vars(_options().parse_args(arguments))
+    arguments_by_name = vars(_options().parse_args(arguments))
     configure_logging()
     allow_open_files()
     try:
-        settings = Settings(**{name: value for name, value in given.items() if value is not None})
+        settings = Settings(**{name: value for name, value in arguments_by_name.items() if value is not None})
         configure_logging(settings.log_format)
         os.umask(settings.file_mask)
         app = create_app(settings)
         listener = listen(settings)
     except ValidationError as error:
-        for found in error.errors():
-            print(f"splatmill_server: {_sentence(found)}", file=sys.stderr)
+        for fault in error.errors():
+            print(f"splatmill_server: {_sentence(fault)}", file=sys.stderr)
         return 2
     except (StorageError, OSError, InvalidRedisUrl, NeedsKey) as error:
         print(f"splatmill_server: {error}", file=sys.stderr)
@@ -138,9 +138,9 @@ class _LineLog(structlog.PrintLogger):
 def allow_open_files() -> None:
     """Let this process open as many files as it may: each client that follows events holds a connection."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = _OPEN_FILES if hard == resource.RLIM_INFINITY else min(hard, _OPEN_FILES)
-    if soft != resource.RLIM_INFINITY and soft < wanted:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+    target = _OPEN_FILES if hard == resource.RLIM_INFINITY else min(hard, _OPEN_FILES)
+    if soft != resource.RLIM_INFINITY and soft < target:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (target, hard))
 
 
 def configure_logging(chosen: LogFormat | None = None, level: int = logging.INFO) -> None:
@@ -177,10 +177,10 @@ def _address(listener: socket.socket) -> str:
     return f"http://{name[0]}:{name[1]}" if isinstance(name, tuple) else f"unix:{name}"
 
 
-def _sentence(found: object) -> str:
-    assert isinstance(found, dict)
-    text = str(found["msg"]).removeprefix("Value error, ")
-    where = ".".join(str(part) for part in found["loc"])
+def _sentence(value: object) -> str:
+    assert isinstance(value, dict)
+    text = str(value["msg"]).removeprefix("Value error, ")
+    where = ".".join(str(part) for part in value["loc"])
     return f"SPLATMILL_{where.upper()}: {text}" if where else text
 
 

@@ -102,7 +102,7 @@ def _edited_report(
 def _read(storage: Storage, model_id: str, name: str) -> dict[str, Any]:
     """A JSON file of a model; {} where it has none that can be read."""
     try:
-        found = json.loads(storage.get(layout.model_file(model_id, name)))
+        content = json.loads(storage.get(layout.model_file(model_id, name)))
     except (FileNotFoundError, ValueError):
         return {}
-    return found if isinstance(found, dict) else {}
+    return content if isinstance(content, dict) else {}

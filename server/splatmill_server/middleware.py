@@ -145,13 +145,13 @@ class RequestMiddleware:
                 scope["state"]["caller"] = await self.authentication.caller(scope, headers)
             except StorageError as error:
                 log.warning("keys cannot be read", error=str(error))
-                found = problem_of_storage(error)
-                raise ProblemError(found.code, found.detail, advice=found.advice) from error
+                problem = problem_of_storage(error)
+                raise ProblemError(problem.code, problem.detail, advice=problem.advice) from error
             except redis.RedisError as error:
                 log.warning("sessions cannot be read", error=str(error))
-                found = problem_of_redis(error, admin=False)
+                problem = problem_of_redis(error, admin=False)
                 raise ProblemError(
-                    found.code, found.detail, advice=found.advice, headers={"Retry-After": "5"}
+                    problem.code, problem.detail, advice=problem.advice, headers={"Retry-After": "5"}
                 ) from error
             await self.rate.admit(scope["state"]["caller"])
         length = read_integer(headers.get("content-length")) or 0
@@ -162,14 +162,14 @@ class RequestMiddleware:
         """Return a `receive` that raises a 413 problem once a body without Content-Length grows too large."""
         if _streams(scope, headers):
             return receive
-        seen = 0
+        received = 0
 
         async def bounded() -> Message:
-            nonlocal seen
+            nonlocal received
             message = await receive()
-            seen += len(message.get("body", b""))
-            if seen > self.max_body:
-                raise self._too_large(seen)
+            received += len(message.get("body", b""))
+            if received > self.max_body:
+                raise self._too_large(received)
             return message
 
         return bounded

@@ -144,34 +144,36 @@ class Models:
             links=_links(model_id),
         )
 
-    def list(self, cursor: str | None, limit: int, wanted: Filter | None = None) -> ModelPage:
-        """Return a page of the models that `wanted` admits, the newest first. Raises the problems of `Lists.page`."""
-        wanted = wanted or Filter()
-        names, narrowed = [lists.name("models", owner=wanted.owner)], wanted.name is not None
-        found, following = self.lists.page(
-            names, cursor, limit, lambda ids: self._listed(ids, wanted), narrowed=narrowed
+    def list(self, cursor: str | None, limit: int, only: Filter | None = None) -> ModelPage:
+        """Return a page of the models that `only` admits, the newest first. Raises the problems of `Lists.page`."""
+        only = only or Filter()
+        names, narrowed = [lists.name("models", owner=only.owner)], only.name is not None
+        models, following = self.lists.page(
+            names, cursor, limit, lambda ids: self._listed(ids, only), narrowed=narrowed
         )
-        return ModelPage(models=found, cursor=following)
+        return ModelPage(models=models, cursor=following)
 
-    def _listed(self, model_ids: Sequence[str], wanted: Filter) -> dict[str, Model]:
-        """Return those of these models that `wanted` admits, by id. What was read of one is kept for lists."""
+    def _listed(self, model_ids: Sequence[str], only: Filter) -> dict[str, Model]:
+        """Return those of these models that `only` admits, by id. What was read of one is kept for lists."""
         known = {name: _kept(kept) for name, kept in self.lists.records("models", model_ids).items()}
         asked = [
             name
-            for name, found in known.items()
-            if not isinstance(found, Model)
-            and (found is None or wanted.admits(wanted.owner or "", found.name))
+            for name, record in known.items()
+            if not isinstance(record, Model)
+            and (record is None or only.admits(only.owner or "", record.name))
         ]
-        read = dict(zip(asked, each(self._found, asked), strict=True))
-        self.lists.keep("models", {name: _keep(found) for name, found in read.items() if found is not None})
-        models = {name: found for name, found in (known | read).items() if isinstance(found, Model)}
+        read = dict(zip(asked, each(self._get_or_none, asked), strict=True))
+        self.lists.keep(
+            "models", {name: _keep(record) for name, record in read.items() if record is not None}
+        )
+        models = {name: record for name, record in (known | read).items() if isinstance(record, Model)}
         return {
-            name: found.model_copy(update={"links": _links(name)})
-            for name, found in models.items()
-            if wanted.admits(found.owner or DEFAULT_OWNER, found.name)
+            name: record.model_copy(update={"links": _links(name)})
+            for name, record in models.items()
+            if only.admits(record.owner or DEFAULT_OWNER, record.name)
         }
 
-    def _found(self, model_id: str) -> Model | None:
+    def _get_or_none(self, model_id: str) -> Model | None:
         """Return a model, or None for one that was deleted or is corrupt, which must not hide the others."""
         try:
             return self.get(model_id)
@@ -189,11 +191,11 @@ class Models:
     def list_missing(self, model_ids: Sequence[str]) -> int:
         """List those of these models that no list holds, as one that was copied into storage; return their number."""
         missing = self.lists.missing("models", model_ids)
-        found = [record for record in each(self._record, missing) if record is not None]
-        for record in found:
+        records = [record for record in each(self._record, missing) if record is not None]
+        for record in records:
             moment = record.finished_at or record.created_at
             lists.add_model(self.lists.connection, record.id, moment, record.owner or DEFAULT_OWNER)
-        return len(found)
+        return len(records)
 
     def make_lists(self, succeeded: Mapping[str, Ended]) -> int:
         """List all models in storage, and return their number. Their files are read when they are first asked for.
@@ -205,23 +207,23 @@ class Models:
         ids = [name for name in self.storage.children(layout.models()) if layout.is_id(name)]
         for start in range(0, len(ids), _LISTED_TOGETHER):
             batch = ids[start : start + _LISTED_TOGETHER]
-            found = {model_id: succeeded[model_id] for model_id in batch if model_id in succeeded}
+            ended = {model_id: succeeded[model_id] for model_id in batch if model_id in succeeded}
             others = [model_id for model_id in batch if model_id not in succeeded]
-            found |= {
+            ended |= {
                 record.id: _ended(record) for record in each(self._record, others) if record is not None
             }
             added = lists.Additions()
-            for model_id, record in found.items():
+            for model_id, record in ended.items():
                 lists.add(added, "models", model_id, record.moment, record.owner)
             with connection.pipeline() as pipe:
                 added.send(pipe)
                 pipe.execute()
-            names = {model_id: _Named(name=record.name) for model_id, record in found.items()}
+            names = {model_id: _Named(name=record.name) for model_id, record in ended.items()}
             self.lists.keep("models", {model_id: _keep(named) for model_id, named in names.items()})
-            for model_id in self.lists.deleted(StoredKind.model, list(found)):
+            for model_id in self.lists.deleted(StoredKind.model, list(ended)):
                 if not self.storage.exists(layout.job_record(model_id)):
-                    lists.remove_model(connection, model_id, found[model_id].owner)
-            count += len(found)
+                    lists.remove_model(connection, model_id, ended[model_id].owner)
+            count += len(ended)
         return count
 
     def _record(self, model_id: str) -> Job | None:
@@ -281,9 +283,11 @@ class Models:
     def _digests(self, model_id: str) -> dict[str, str]:
         """Return the SHA-256 of the files that `job.json` names."""
         digests = json.loads(self.storage.get(layout.job_record(model_id))).get("sha256")
-        found = digests.items() if isinstance(digests, dict) else ()
+        digests_by_name = digests.items() if isinstance(digests, dict) else ()
         return {
-            name: digest for name, digest in found if isinstance(digest, str) and _SHA256.fullmatch(digest)
+            name: digest
+            for name, digest in digests_by_name
+            if isinstance(digest, str) and _SHA256.fullmatch(digest)
         }
 
     def _quality(self, model_id: str) -> tuple[Any, Any]:
@@ -318,9 +322,9 @@ def _links(model_id: str) -> dict[str, str]:
     }
 
 
-def _keep(found: Model | _Named) -> bytes:
+def _keep(record: Model | _Named) -> bytes:
     """Return what Redis keeps of a model for lists: digests and names of files, in a third of their bytes."""
-    return zlib.compress(found.model_dump_json(exclude={"links"}).encode())
+    return zlib.compress(record.model_dump_json(exclude={"links"}).encode())
 
 
 def _kept(stored: bytes | None) -> Model | _Named | None:

@@ -133,8 +133,8 @@ class Shares:
     def list(self, model_id: str) -> list[Share]:
         """Return the links to a model, newest first, those that have ended too."""
         self.models.check(model_id)
-        found = sorted(self._stored(model_id), key=lambda share: (share.created_at, share.id), reverse=True)
-        return [share.public() for share in found]
+        shares = sorted(self._stored(model_id), key=lambda share: (share.created_at, share.id), reverse=True)
+        return [share.public() for share in shares]
 
     def revoke(self, model_id: str, share_id: str) -> None:
         """End a link for good; one that has ended stays as it is. Raises a 404 problem."""
@@ -179,11 +179,11 @@ class Shares:
 
     def get_cameras(self, share: StoredShare) -> ModelCameras:
         """Return the cameras of the photos; those of a link without photos name no photo that it would not give out."""
-        found = self.models.get_cameras(share.model)
+        all_cameras = self.models.get_cameras(share.model)
         if share.photos:
-            return found
-        cameras = [camera.model_copy(update={"photo": None}) for camera in found.cameras]
-        return found.model_copy(update={"cameras": cameras})
+            return all_cameras
+        cameras = [camera.model_copy(update={"photo": None}) for camera in all_cameras.cameras]
+        return all_cameras.model_copy(update={"cameras": cameras})
 
     def _stored(self, model_id: str) -> Sequence[StoredShare]:
         entries = self.storage.entries(layout.shares_of(model_id))

@@ -131,8 +131,8 @@ class Webhooks:
     def list(self, owner: str | None) -> list[WebhookRecord]:
         """Return the webhooks of an owner, or of all (None), oldest first."""
         ids = self.storage.children(layout.webhooks())
-        found = [record for webhook_id in ids if (record := self.get_or_none(webhook_id)) is not None]
-        mine = [record for record in found if owner is None or record.owner == owner]
+        webhooks = [record for webhook_id in ids if (record := self.get_or_none(webhook_id)) is not None]
+        mine = [record for record in webhooks if owner is None or record.owner == owner]
         return sorted(mine, key=lambda record: record.created_at)
 
     def get_or_none(self, webhook_id: str) -> WebhookRecord | None:
@@ -148,10 +148,10 @@ class Webhooks:
 
     def get(self, webhook_id: str) -> WebhookRecord:
         """Return a webhook. Raises a 404 problem."""
-        found = self.get_or_none(webhook_id) if layout.is_id(webhook_id) else None
-        if found is None:
+        webhook = self.get_or_none(webhook_id) if layout.is_id(webhook_id) else None
+        if webhook is None:
             raise webhook_not_found(webhook_id)
-        return found
+        return webhook
 
     def delete(self, webhook_id: str) -> None:
         """Delete a webhook and the log of its deliveries. Those that are pending are not sent any more."""
@@ -189,10 +189,10 @@ class Webhooks:
         """Return the deliveries of a webhook, newest first. Those that are over are kept for KEPT_DAYS."""
         entries = self.storage.entries(layout.deliveries(webhook_id))
         ids = [entry.path.rsplit("/", 1)[-1].removesuffix(".json") for entry in entries]
-        found = [
+        deliveries = [
             record.public() for name in ids if (record := self.get_delivery(webhook_id, name)) is not None
         ]
-        return sorted(found, key=lambda record: record.created_at, reverse=True)
+        return sorted(deliveries, key=lambda record: record.created_at, reverse=True)
 
     def get_delivery(self, webhook_id: str, delivery_id: str) -> DeliveryRecord | None:
         """Return a delivery, or None if there is none, or none that can be read."""
@@ -207,27 +207,27 @@ class Webhooks:
 
     def repeat(self, webhook_id: str, delivery_id: str) -> Delivery:
         """Send a delivery that is over once more, with the same message id. Raises a 404 problem."""
-        found = self.get_delivery(webhook_id, delivery_id) if layout.is_id(delivery_id) else None
-        if found is not None and found.state is not DeliveryState.pending:
+        delivery = self.get_delivery(webhook_id, delivery_id) if layout.is_id(delivery_id) else None
+        if delivery is not None and delivery.state is not DeliveryState.pending:
             with exclusive(self.connection, "delivery", f"{webhook_id}.{delivery_id}"):
-                found = self._repeated(webhook_id, delivery_id)
-        if found is None:
+                delivery = self._repeated(webhook_id, delivery_id)
+        if delivery is None:
             raise ProblemError(
                 "delivery_not_found",
                 f"The webhook has no delivery {delivery_id[:80]!r}.",
                 advice="List the deliveries with GET /v1/webhooks/{id}/deliveries.",
             )
-        return found.public()
+        return delivery.public()
 
     def _repeated(self, webhook_id: str, delivery_id: str) -> DeliveryRecord | None:
         """Make a delivery that is over pending again, unless another request has."""
-        found = self.get_delivery(webhook_id, delivery_id)
-        if found is not None and found.state is not DeliveryState.pending:
+        delivery = self.get_delivery(webhook_id, delivery_id)
+        if delivery is not None and delivery.state is not DeliveryState.pending:
             update = {"state": DeliveryState.pending, "next_at": _at_once(), "tries": 0, "reason": None}
-            found = found.model_copy(update=update)
-            self.save_delivery(found)
-            self.mark(found)
-        return found
+            delivery = delivery.model_copy(update=update)
+            self.save_delivery(delivery)
+            self.mark(delivery)
+        return delivery
 
     def save_delivery(self, record: DeliveryRecord) -> None:
         """Store a delivery, unless its webhook was deleted."""
@@ -282,8 +282,10 @@ class Webhooks:
         for webhook_id in self.storage.children(layout.webhooks()):
             for entry in self.storage.entries(layout.deliveries(webhook_id)):
                 name = entry.path.rsplit("/", 1)[-1].removesuffix(".json")
-                found = self.get_delivery(webhook_id, name) if entry.modified.timestamp() < before else None
-                if found is not None and found.state is not DeliveryState.pending:
+                delivery = (
+                    self.get_delivery(webhook_id, name) if entry.modified.timestamp() < before else None
+                )
+                if delivery is not None and delivery.state is not DeliveryState.pending:
                     self.storage.delete(entry.path)
                     deleted += 1
         return deleted

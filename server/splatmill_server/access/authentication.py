@@ -24,26 +24,26 @@ class Authentication:
     redis.RedisError if a session cannot be looked up."""
 
     def __init__(self, settings: Settings, keys: Keys, sessions: Sessions) -> None:
-        given = settings.api_key.get_secret_value() if settings.api_key is not None else None
-        self._bootstrap = digest(given) if given is not None else None
+        bootstrap = settings.api_key.get_secret_value() if settings.api_key is not None else None
+        self._bootstrap = digest(bootstrap) if bootstrap is not None else None
         self._settings = settings
         self._keys = keys
         self._sessions = sessions
 
     async def caller(self, scope: Scope, headers: Headers) -> Caller:
         """Return the caller of a request."""
-        given = bearer(headers)
-        if given is not None and (known := self._of_bootstrap(digest(given))) is not None:
+        secret = bearer(headers)
+        if secret is not None and (known := self._of_bootstrap(digest(secret))) is not None:
             return known
         await self._keys.current()
-        if given is not None and (key := self._keys.get_by_secret(given)) is not None:
+        if secret is not None and (key := self._keys.get_by_secret(secret)) is not None:
             return Caller.of(key)
         if self._bootstrap is None and self._settings.local and not self._keys.any():
             check_host(scope, headers, self._settings.host, self._settings.own_names)
             check_origin(scope, headers, self._settings.own_names, self._settings.cors, required=False)
             return KEYLESS
         cookie = session_cookie(headers)
-        if given is None and cookie and (session := await self._sessions.get(cookie)) is not None:
+        if secret is None and cookie and (session := await self._sessions.get(cookie)) is not None:
             known = self._of_session(session)
             if known is not None:
                 check_origin(scope, headers, self._settings.own_names, required=True)
@@ -87,8 +87,8 @@ class Authentication:
 
 def bearer(headers: Headers) -> str | None:
     """Return the key in the header Authorization, or None."""
-    scheme, _, given = headers.get("authorization", "").partition(" ")
-    return given.strip() if scheme.lower() == "bearer" else None
+    scheme, _, token = headers.get("authorization", "").partition(" ")
+    return token.strip() if scheme.lower() == "bearer" else None
 
 
 def session_cookie(headers: Headers) -> str | None:

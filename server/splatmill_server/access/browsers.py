@@ -27,15 +27,15 @@ def check_host(scope: Scope, headers: Headers, host: str, allowed: Sequence[str]
     host: the address that the server was told to listen on.
     allowed: further names, as in SPLATMILL_ALLOWED_HOSTS.
     """
-    given = headers.get("host", "")
-    name = _name(given)
+    named = headers.get("host", "")
+    name = _name(named)
     listening = scope.get("server") or ("", None)
     local = name == "localhost" or name.endswith(".localhost") or is_loopback(name)
     if name and (local or name in (host.lower(), str(listening[0]).lower()) or _among(name, allowed)):
         return
     raise ProblemError(
         "host_not_allowed",
-        f"The request is addressed to {given[:80]!r}, and this server without keys answers to names of its machine "
+        f"The request is addressed to {named[:80]!r}, and this server without keys answers to names of its machine "
         "only.",
         advice="Use http://localhost or the address that the server listens on. If this is the name of a proxy before "
         "the server, add it to SPLATMILL_ALLOWED_HOSTS.",

@@ -149,8 +149,8 @@ class Keys:
     def list(self) -> list[Key]:
         """Return all keys, the oldest first."""
         self.read()
-        found = [key for _, key in self._known.values() if key is not None]
-        return [key.public() for key in sorted(found, key=lambda key: (key.created_at, key.id))]
+        keys = [key for _, key in self._known.values() if key is not None]
+        return [key.public() for key in sorted(keys, key=lambda key: (key.created_at, key.id))]
 
     def get(self, key_id: str) -> StoredKey:
         """Return a key. Raises a 404 problem."""
@@ -242,7 +242,7 @@ class Keys:
 
     def _admin_besides(self, key_id: str | None) -> bool:
         """Return whether an admin's key is left without the key `key_id`."""
-        others = (key for found, (_, key) in self._known.items() if found != key_id)
+        others = (key for other_id, (_, key) in self._known.items() if other_id != key_id)
         return self.bootstrap or any(key is not None and Scope.admin in key.scopes for key in others)
 
     def _store(self, key: StoredKey) -> None:

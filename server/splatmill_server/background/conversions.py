@@ -77,7 +77,7 @@ class Conversions:
         etag = self._ply(model_id).etag
         formats = []
         for key, form in DOWNLOADS.items():
-            found = None if key == STORED_AS_IT_IS else self._find(model_id, form, etag)
+            conversion = None if key == STORED_AS_IT_IS else self._find(model_id, form, etag)
             formats.append(
                 ModelDownload(
                     format=key,
@@ -86,8 +86,12 @@ class Conversions:
                     loses=form.loses,
                     readers=[*form.readers],
                     address=address(f"/v1/models/{model_id}/download/{key}"),
-                    bytes=model.bytes if key == STORED_AS_IT_IS else found[0].size if found else None,
-                    conversion=found[1] if found else None,
+                    bytes=model.bytes
+                    if key == STORED_AS_IT_IS
+                    else conversion[0].size
+                    if conversion
+                    else None,
+                    conversion=conversion[1] if conversion else None,
                 )
             )
         return ModelDownloads(formats=formats, psnr=model.psnr)
@@ -219,8 +223,12 @@ def format_of_key(key: str) -> ModelFormat:
 def _refused(body: bytes) -> ProblemError:
     """The problem that the renderer answered with."""
     try:
-        found = Problem.model_validate(json.loads(body))
+        problem = Problem.model_validate(json.loads(body))
     except (ValueError, ValidationError):
         return ProblemError("conversion_failed", "The renderer answered without a problem document.")
-    code = "conversion_failed" if found.code == "render_failed" or found.code not in PROBLEMS else found.code
-    return ProblemError(code, found.detail, advice=found.advice, facts=found.facts)
+    code = (
+        "conversion_failed"
+        if problem.code == "render_failed" or problem.code not in PROBLEMS
+        else problem.code
+    )
+    return ProblemError(code, problem.detail, advice=problem.advice, facts=problem.facts)

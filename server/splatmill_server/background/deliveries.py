@@ -158,8 +158,8 @@ class Deliveries:
         running = {webhook_id for webhook_id, _ in [*self._running]}
         self._owners = {name: owner for name, owner in self._owners.items() if name in waiting | running}
         for webhook_id in waiting - self._owners.keys():
-            found = self.webhooks.get_or_none(webhook_id)
-            self._owners[webhook_id] = found.owner if found is not None else ""
+            webhook = self.webhooks.get_or_none(webhook_id)
+            self._owners[webhook_id] = webhook.owner if webhook is not None else ""
 
     async def _work(self, key: tuple[str, str], mark: str) -> None:
         ended = True
@@ -182,28 +182,28 @@ class Deliveries:
     async def _attempt(self, key: tuple[str, str], mark: str) -> None:
         """Make the attempt that a mark announces, unless another process has made it, and remove the mark."""
         webhook = await run_in_threadpool(self.webhooks.get_or_none, key[0])
-        found = await run_in_threadpool(self.webhooks.get_delivery, *key)
-        if webhook is not None and found is not None and found.state is DeliveryState.pending:
-            assert found.next_at is not None
-            if found.next_at <= datetime.now(UTC):
-                found = _counted(found)
+        delivery = await run_in_threadpool(self.webhooks.get_delivery, *key)
+        if webhook is not None and delivery is not None and delivery.state is DeliveryState.pending:
+            assert delivery.next_at is not None
+            if delivery.next_at <= datetime.now(UTC):
+                delivery = _counted(delivery)
                 # Before it is sent: an attempt that cannot be counted is not made, or it would be made for ever.
-                await run_in_threadpool(self.webhooks.save_delivery, found)
-                found = await self._send(webhook, found)
-                await run_in_threadpool(self.webhooks.save_delivery, found)
-                result = "retried" if found.state is DeliveryState.pending else found.state.value
+                await run_in_threadpool(self.webhooks.save_delivery, delivery)
+                delivery = await self._send(webhook, delivery)
+                await run_in_threadpool(self.webhooks.save_delivery, delivery)
+                result = "retried" if delivery.state is DeliveryState.pending else delivery.state.value
                 self.metrics.webhook_attempts.labels(result).inc()
-            if found.state is DeliveryState.pending:
-                await run_in_threadpool(self.webhooks.mark, found)
-                if mark == mark_of(found):
+            if delivery.state is DeliveryState.pending:
+                await run_in_threadpool(self.webhooks.mark, delivery)
+                if mark == mark_of(delivery):
                     return
         await run_in_threadpool(self.storage.delete, mark)
 
-    async def _send(self, webhook: WebhookRecord, found: DeliveryRecord) -> DeliveryRecord:
+    async def _send(self, webhook: WebhookRecord, delivery: DeliveryRecord) -> DeliveryRecord:
         """Return a counted delivery after its attempt. A webhook that refuses for good is disabled."""
         if webhook.disabled_at is not None:
-            return _failed(found, "The webhook is disabled.")
-        begun, at, body = time.monotonic(), datetime.now(UTC), found.body.encode()
+            return _failed(delivery, "The webhook is disabled.")
+        begun, at, body = time.monotonic(), datetime.now(UTC), delivery.body.encode()
         status, answer, failure, retry_after = None, None, None, 0.0
         try:
             async with (
@@ -211,7 +211,7 @@ class Deliveries:
                 self.outgoing.request(
                     "POST",
                     webhook.url,
-                    headers=_headers(webhook, found, int(at.timestamp()), body),
+                    headers=_headers(webhook, delivery, int(at.timestamp()), body),
                     body=body,
                     read_seconds=ANSWER_SECONDS,
                 ) as reply,
@@ -224,7 +224,7 @@ class Deliveries:
         except OutgoingError as error:
             failure = str(error)
         except Exception as error:
-            log.exception("an attempt ended unexpectedly", webhook=webhook.id, delivery=found.id)
+            log.exception("an attempt ended unexpectedly", webhook=webhook.id, delivery=delivery.id)
             failure = f"The attempt ended in an unexpected error ({type(error).__name__})."
         made = DeliveryAttempt(
             at=at,
@@ -233,26 +233,26 @@ class Deliveries:
             answer=answer or None,
             error=failure,
         )
-        found = found.model_copy(update={"attempts": [*found.attempts, made]})
+        delivery = delivery.model_copy(update={"attempts": [*delivery.attempts, made]})
         if status is not None and 200 <= status < 300:
-            return found.model_copy(update={"state": DeliveryState.delivered, "next_at": None})
+            return delivery.model_copy(update={"state": DeliveryState.delivered, "next_at": None})
         if status == 410:
             await run_in_threadpool(self.webhooks.disable, webhook.id, "The address answered 410 (Gone).")
-            return _failed(found, "The address answered 410 (Gone).")
-        if found.tries > len(PAUSES):
-            since = format_duration((at - found.created_at).total_seconds())
-            reason = f"{found.tries} attempts to deliver {found.id} failed in {since}, the last one because: "
+            return _failed(delivery, "The address answered 410 (Gone).")
+        if delivery.tries > len(PAUSES):
+            since = format_duration((at - delivery.created_at).total_seconds())
+            reason = f"{delivery.tries} attempts to deliver {delivery.id} failed in {since}, the last one because: "
             reason += failure or f"the answer had the status {status}."
             await run_in_threadpool(self.webhooks.disable, webhook.id, reason)
-            return _failed(found, reason)
-        pause = max(_pause(found.tries), min(retry_after, LONGEST_RETRY_AFTER))
-        return found.model_copy(update={"next_at": datetime.now(UTC) + timedelta(seconds=pause)})
+            return _failed(delivery, reason)
+        pause = max(_pause(delivery.tries), min(retry_after, LONGEST_RETRY_AFTER))
+        return delivery.model_copy(update={"next_at": datetime.now(UTC) + timedelta(seconds=pause)})
 
 
-def _counted(found: DeliveryRecord) -> DeliveryRecord:
+def _counted(delivery: DeliveryRecord) -> DeliveryRecord:
     """Return the delivery with one attempt more, and the time of the next one if nothing more becomes known of this."""
-    tries = found.tries + 1
-    return found.model_copy(
+    tries = delivery.tries + 1
+    return delivery.model_copy(
         update={"tries": tries, "next_at": datetime.now(UTC) + timedelta(seconds=_pause(tries))}
     )
 
@@ -262,15 +262,15 @@ def _pause(tries: int) -> float:
     return PAUSES[min(tries, len(PAUSES)) - 1] * random.uniform(1 - JITTER, 1 + JITTER)
 
 
-def _headers(webhook: WebhookRecord, found: DeliveryRecord, timestamp: int, body: bytes) -> dict[str, str]:
-    signatures = [sign(secret, found.message, timestamp, body) for secret in webhook.valid_secrets()]
+def _headers(webhook: WebhookRecord, delivery: DeliveryRecord, timestamp: int, body: bytes) -> dict[str, str]:
+    signatures = [sign(secret, delivery.message, timestamp, body) for secret in webhook.valid_secrets()]
     return {
         "Content-Type": "application/json",
-        "webhook-id": found.message,
+        "webhook-id": delivery.message,
         "webhook-timestamp": str(timestamp),
         "webhook-signature": " ".join(signatures),
     }
 
 
-def _failed(found: DeliveryRecord, reason: str) -> DeliveryRecord:
-    return found.model_copy(update={"state": DeliveryState.failed, "next_at": None, "reason": reason})
+def _failed(delivery: DeliveryRecord, reason: str) -> DeliveryRecord:
+    return delivery.model_copy(update={"state": DeliveryState.failed, "next_at": None, "reason": reason})

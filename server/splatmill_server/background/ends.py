@@ -35,9 +35,9 @@ class Ends:
         """Retire jobs that have ended until this task is cancelled."""
         while True:
             try:
-                found = await cast(Any, self._connection.brpop([keys.ENDS], timeout=_WAIT))
-                if found is not None:
-                    await run_in_threadpool(self._jobs.retire, found[1].decode())
+                end = await cast(Any, self._connection.brpop([keys.ENDS], timeout=_WAIT))
+                if end is not None:
+                    await run_in_threadpool(self._jobs.retire, end[1].decode())
             except redis.RedisError as error:
                 log.warning("the ends of jobs cannot be read", error=str(error))
                 await asyncio.sleep(_PAUSE)

@@ -153,22 +153,22 @@ class Imports:
 
     def get(self, capture_id: str, import_id: str) -> Import:
         """Return an import. Raises a 404 problem."""
-        found = self._read(capture_id, import_id) if layout.is_id(import_id) else None
-        if found is None:
+        record = self._read(capture_id, import_id) if layout.is_id(import_id) else None
+        if record is None:
             raise ProblemError(
                 "import_not_found",
                 f"The capture has no import {import_id[:80]!r}.",
                 advice="List the imports with GET /v1/captures/{id}/imports.",
             )
-        return found
+        return record
 
     def list(self, capture_id: str) -> list[Import]:
         """Return the imports of a capture, newest first."""
         self.captures.get(capture_id)
         entries = self.storage.entries(layout.capture_imports(capture_id))
         names = [entry.path.rsplit("/", 1)[-1].removesuffix(".json") for entry in entries]
-        found = [record for name in names if (record := self._read(capture_id, name)) is not None]
-        return sorted(found, key=lambda record: record.created_at, reverse=True)
+        records = [record for name in names if (record := self._read(capture_id, name)) is not None]
+        return sorted(records, key=lambda record: record.created_at, reverse=True)
 
     async def run(self) -> None:
         """Take up unfinished imports until this task is cancelled. A cancelled import is taken up again later."""
@@ -187,89 +187,89 @@ class Imports:
     async def _work(self, name: str) -> float | None:
         """Make an attempt. Return the seconds until the next one, or None at the end of the import."""
         capture_id, _, import_id = name.partition(".")
-        found = await run_in_threadpool(self._read, capture_id, import_id)
-        if found is not None and not found.state.final and await run_in_threadpool(self._exists, name):
-            found = found.model_copy(
-                update={"state": ImportState.running, "attempts": found.attempts + 1, "received": 0}
+        record = await run_in_threadpool(self._read, capture_id, import_id)
+        if record is not None and not record.state.final and await run_in_threadpool(self._exists, name):
+            record = record.model_copy(
+                update={"state": ImportState.running, "attempts": record.attempts + 1, "received": 0}
             )
-            await run_in_threadpool(self._write, found)
-            found = await self._attempt(found)
-            if found.state.final:
-                found = found.model_copy(update={"finished_at": datetime.now(UTC)})
-            await run_in_threadpool(self._write, found)
-            if not found.state.final:
-                return _PAUSE_SECONDS * float(2 ** (found.attempts - 1))
-        elif found is not None and not found.state.final:  # written while the capture was being deleted
+            await run_in_threadpool(self._write, record)
+            record = await self._attempt(record)
+            if record.state.final:
+                record = record.model_copy(update={"finished_at": datetime.now(UTC)})
+            await run_in_threadpool(self._write, record)
+            if not record.state.final:
+                return _PAUSE_SECONDS * float(2 ** (record.attempts - 1))
+        elif record is not None and not record.state.final:  # written while the capture was being deleted
             await run_in_threadpool(self.storage.delete, layout.import_record(capture_id, import_id))
         await run_in_threadpool(self.storage.delete, layout.unfinished_import(capture_id, import_id))
         return None
 
-    async def _attempt(self, found: Import) -> Import:
+    async def _attempt(self, record: Import) -> Import:
         """Return the import after an attempt: ended, or waiting for the next one."""
         try:
             async with asyncio.timeout(self.settings.import_seconds):
-                return await self._fetch(found)
+                return await self._fetch(record)
         except TimeoutError:
             limit = f"{self.settings.import_seconds:.0f} seconds"
-            return _failed(found, "import_failed", f"The file did not arrive within {limit}.")
+            return _failed(record, "import_failed", f"The file did not arrive within {limit}.")
         except TooSlow as error:
-            return _failed(found, "import_failed", str(error))
+            return _failed(record, "import_failed", str(error))
         except AddressRefused as error:
-            return _failed(found, "url_refused", str(error))
+            return _failed(record, "url_refused", str(error))
         except (ProblemError, StorageError) as error:
             if isinstance(error, ProblemError):
                 problem = error.problem
             else:
-                log.warning("storage error", error=str(error), id=found.id)
+                log.warning("storage error", error=str(error), id=record.id)
                 problem = problem_of_storage(error)
             # A 503 problem may pass, such as that of a storage that has not been listed yet.
-            if problem.status == 503 and found.attempts < MAX_ATTEMPTS:
-                return _tried(found, problem.detail)
-            return found.model_copy(update={"state": ImportState.failed, "problem": problem})
+            if problem.status == 503 and record.attempts < MAX_ATTEMPTS:
+                return _tried(record, problem.detail)
+            return record.model_copy(update={"state": ImportState.failed, "problem": problem})
         except redis.RedisError:
             raise  # the import waits until Redis answers, without which no lease is given
         except Exception as error:
             # Counted, whatever it is: what others send must not be fetched for ever.
             if isinstance(error, NoAnswer):
-                return _tried(found, str(error))
-            log.exception("an attempt ended unexpectedly", id=found.id)
-            return _tried(found, f"The attempt ended in an unexpected error ({type(error).__name__}).")
+                return _tried(record, str(error))
+            log.exception("an attempt ended unexpectedly", id=record.id)
+            return _tried(record, f"The attempt ended in an unexpected error ({type(error).__name__}).")
 
-    async def _fetch(self, found: Import) -> Import:
+    async def _fetch(self, record: Import) -> Import:
         async with AsyncExitStack() as stack:
             try:
                 async with asyncio.timeout(_ANSWER_SECONDS):
-                    asked = self.outgoing.request("GET", found.url, redirects=MAX_REDIRECTS)
+                    asked = self.outgoing.request("GET", record.url, redirects=MAX_REDIRECTS)
                     answer = await stack.enter_async_context(asked)
             except TimeoutError:
                 limit = f"{_ANSWER_SECONDS:.0f} seconds"
                 raise NoAnswer(f"The other server did not begin to answer within {limit}.") from None
             _check(answer)
-            found = found.model_copy(update={"size": answer.size})
-            chunks = self._recorded(found, at_least(answer.chunks, self.settings.min_import_rate))
+            record = record.model_copy(update={"size": answer.size})
+            chunks = self._recorded(record, at_least(answer.chunks, self.settings.min_import_rate))
             async with self.quota.upload(
-                None, found.capture, answer.size, beside=bytes_beside(found.name)
+                None, record.capture, answer.size, beside=bytes_beside(record.name)
             ) as arrival:
                 file, new = await self.captures.save_file(
-                    found.capture,
-                    found.role,
-                    found.name,
+                    record.capture,
+                    record.role,
+                    record.name,
                     arrival.counted(chunks),
-                    announced_sha256=found.sha256,
+                    announced_sha256=record.sha256,
                     announced_size=answer.size,
                 )
                 arrival.stored = file.size if new else 0
-        return found.model_copy(
+        return record.model_copy(
             update={"state": ImportState.succeeded, "received": file.size, "file": file, "name": file.name}
         )
 
-    async def _recorded(self, found: Import, chunks: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
+    async def _recorded(self, record: Import, chunks: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
         """Pass the bytes on, and record their number every few seconds."""
         received, written = 0, time.monotonic()
         async for chunk in chunks:
             received += len(chunk)
             if time.monotonic() - written >= _RECORD_SECONDS:
-                await run_in_threadpool(self._write, found.model_copy(update={"received": received}))
+                await run_in_threadpool(self._write, record.model_copy(update={"received": received}))
                 written = time.monotonic()
             yield chunk
 
@@ -307,16 +307,16 @@ def _check(answer: Answer) -> None:
         )
 
 
-def _tried(found: Import, reason: str) -> Import:
+def _tried(record: Import, reason: str) -> Import:
     """Return the import after an attempt that failed: waiting for the next one, or failed after the last."""
-    if found.attempts >= MAX_ATTEMPTS:
-        return _failed(found, "import_failed", f"{reason} It was tried {found.attempts} times.")
-    log.info("an import is tried again", id=found.id, attempt=found.attempts, reason=reason)
-    return found.model_copy(update={"state": ImportState.queued})
+    if record.attempts >= MAX_ATTEMPTS:
+        return _failed(record, "import_failed", f"{reason} It was tried {record.attempts} times.")
+    log.info("an import is tried again", id=record.id, attempt=record.attempts, reason=reason)
+    return record.model_copy(update={"state": ImportState.queued})
 
 
-def _failed(found: Import, code: str, detail: str) -> Import:
-    return found.model_copy(update={"state": ImportState.failed, "problem": Problem.of(code, detail)})
+def _failed(record: Import, code: str, detail: str) -> Import:
+    return record.model_copy(update={"state": ImportState.failed, "problem": Problem.of(code, detail)})
 
 
 def _name_of(url: str) -> str:

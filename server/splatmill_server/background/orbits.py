@@ -133,9 +133,9 @@ class Orbits:
         if self._renderer is None:
             raise no_renderer()
         orbit_id = _id_of(ply.etag, request)
-        found = self._read(model_id, orbit_id)
-        if found is not None and found.state is OrbitState.succeeded:
-            return found
+        orbit = self._read(model_id, orbit_id)
+        if orbit is not None and orbit.state is OrbitState.succeeded:
+            return orbit
         owner = self._owner(model_id)
         # Until the mark is there: of many requests at once, each counts those before it.
         with exclusive(self._connection, "orbits", _line_of(owner)):
@@ -143,13 +143,13 @@ class Orbits:
 
     def _mark(self, model_id: str, orbit_id: str, request: OrbitRequest, who: Caller, owner: str) -> Orbit:
         """Record and mark an orbit video, unless another request has. Raises the problems of `create`."""
-        found = self._read(model_id, orbit_id)
-        if found is not None and found.state is OrbitState.succeeded:
-            return found
+        orbit = self._read(model_id, orbit_id)
+        if orbit is not None and orbit.state is OrbitState.succeeded:
+            return orbit
         mark = layout.unfinished_orbit(_line_of(owner), model_id, orbit_id)
-        if found is None or found.state is OrbitState.failed:
-            self._check_number(model_id, _line_of(owner), new=found is None)
-            found = Orbit(
+        if orbit is None or orbit.state is OrbitState.failed:
+            self._check_number(model_id, _line_of(owner), new=orbit is None)
+            orbit = Orbit(
                 id=orbit_id,
                 model=model_id,
                 request=request,
@@ -158,11 +158,11 @@ class Orbits:
                 created_at=datetime.now(UTC),
             )
             with self._quota.room(who, owner, model_id, RECORD_BYTES) as room:
-                self._put(found)
+                self._put(orbit)
                 room.stored = RECORD_BYTES
         # After the record, without which a mark is removed; also for a record whose mark was never written.
         self._storage.put_new(mark, b"{}")
-        return _with_links(found)
+        return _with_links(orbit)
 
     def _check_number(self, model_id: str, line: str, *, new: bool) -> None:
         marks = [entry.path.rsplit("/", 1)[-1] for entry in self._storage.entries(layout.unfinished_orbits())]
@@ -184,26 +184,26 @@ class Orbits:
     def get(self, model_id: str, orbit_id: str) -> Orbit:
         """Return an orbit video. Raises 404 problems, and the problems of the model."""
         self._models.check(model_id)
-        found = self._read(model_id, orbit_id) if layout.is_id(orbit_id) else None
-        if found is None:
+        orbit = self._read(model_id, orbit_id) if layout.is_id(orbit_id) else None
+        if orbit is None:
             raise ProblemError(
                 "orbit_not_found",
                 f"The model {model_id} has no orbit video {orbit_id[:80]!r}.",
                 advice=f"List its orbit videos with GET /v1/models/{model_id}/orbits.",
             )
-        return found
+        return orbit
 
     def get_video_path(self, model_id: str, orbit_id: str) -> str:
         """Return the path of a video in storage. Raises the problems of `get`, and a 409 problem if it is not whole."""
-        found = self.get(model_id, orbit_id)
-        if found.state is not OrbitState.succeeded:
+        orbit = self.get(model_id, orbit_id)
+        if orbit.state is not OrbitState.succeeded:
             raise ProblemError(
                 "orbit_not_ready",
-                f"{found.frames_done} of {found.frames} frames are rendered; the orbit video is {found.state.value}.",
+                f"{orbit.frames_done} of {orbit.frames} frames are rendered; the orbit video is {orbit.state.value}.",
                 advice="Wait until it has succeeded."
-                if found.problem is None
+                if orbit.problem is None
                 else "Ask for it again with POST; its problem says why it failed.",
-                facts={"state": found.state.value, "frames_done": found.frames_done, "frames": found.frames},
+                facts={"state": orbit.state.value, "frames_done": orbit.frames_done, "frames": orbit.frames},
             )
         return layout.orbit_video(model_id, orbit_id)
 
@@ -211,8 +211,8 @@ class Orbits:
         """Return the orbit videos of a model, newest first. Raises the problems of the model."""
         self._models.check(model_id)
         names = self._storage.children(layout.model_orbits(model_id))
-        found = [orbit for name in names if (orbit := self._read(model_id, name)) is not None]
-        return sorted(found, key=lambda orbit: orbit.created_at, reverse=True)
+        orbits = [orbit for name in names if (orbit := self._read(model_id, name)) is not None]
+        return sorted(orbits, key=lambda orbit: orbit.created_at, reverse=True)
 
     async def delete(self, model_id: str, orbit_id: str) -> None:
         """Delete an orbit video. One that is not whole is not rendered any further. Raises the problems of `get`."""
@@ -242,9 +242,9 @@ class Orbits:
         """Have an orbit video rendered to its end, or return the seconds after which the renderer is asked again."""
         _, model_id, orbit_id = name.split(".")
         failures = self._failures.pop(name, 0)
-        while (found := await run_in_threadpool(self._read, model_id, orbit_id)) and not found.state.final:
+        while (orbit := await run_in_threadpool(self._read, model_id, orbit_id)) and not orbit.state.final:
             try:
-                after = await self._next(name, found)
+                after = await self._next(name, orbit)
                 failures = 0
             except _Delayed as delay:
                 failures += delay.counts
@@ -252,41 +252,41 @@ class Orbits:
                 if failures < MAX_ATTEMPTS:
                     self._failures[name] = failures
                     return _PAUSE_SECONDS
-                after = _failed(found, delay.problem)
+                after = _failed(orbit, delay.problem)
             except ProblemError as error:
-                after = _failed(found, error.problem)
+                after = _failed(orbit, error.problem)
             except (StorageError, RedisError):
                 raise  # the video waits until storage and Redis answer
             except Exception as error:
                 log.exception("an orbit video failed unexpectedly", model=model_id, id=orbit_id)
                 after = _failed(
-                    found, _orbit_problem("render_failed", f"Unexpected error: {type(error).__name__}.")
+                    orbit, _orbit_problem("render_failed", f"Unexpected error: {type(error).__name__}.")
                 )
             if after is not None:
                 await run_in_threadpool(self._write, name, after)
-        if found is None:
+        if orbit is None:
             await run_in_threadpool(self._storage.delete_prefix, layout.orbit(model_id, orbit_id))
-        elif found.state is OrbitState.succeeded:
+        elif orbit.state is OrbitState.succeeded:
             await run_in_threadpool(self._storage.delete_prefix, layout.orbit_frames(model_id, orbit_id))
         await run_in_threadpool(self._storage.delete, f"{layout.unfinished_orbits()}/{name}")
         return None
 
-    async def _next(self, name: str, found: Orbit) -> Orbit | None:
+    async def _next(self, name: str, orbit: Orbit) -> Orbit | None:
         """Have the next part rendered, or the video made of all, and return the record; None if it was deleted."""
-        model_id, first = found.model, found.frames_done
-        if first < found.frames:
-            count = min(_part_frames(found.request), found.frames - first)
-            body = OrbitFrames(orbit=found.request, first=first, count=count)
-            path = layout.orbit_frames(model_id, found.id, first)
+        model_id, first = orbit.model, orbit.frames_done
+        if first < orbit.frames:
+            count = min(_part_frames(orbit.request), orbit.frames - first)
+            body = OrbitFrames(orbit=orbit.request, first=first, count=count)
+            path = layout.orbit_frames(model_id, orbit.id, first)
             await self._ask(name, rendering.orbit_frames_path(model_id), body, path)
-            return found.model_copy(update={"state": OrbitState.running, "frames_done": first + count})
-        path = layout.orbit_video(model_id, found.id)
-        whole = JoinOrbit(orbit=found.id, frames=found.frames)
+            return orbit.model_copy(update={"state": OrbitState.running, "frames_done": first + count})
+        path = layout.orbit_video(model_id, orbit.id)
+        whole = JoinOrbit(orbit=orbit.id, frames=orbit.frames)
         await self._ask(name, rendering.orbit_join_path(model_id), whole, path)
         entry = await run_in_threadpool(self._storage.head, path)
         if entry is None:
             return None
-        return found.model_copy(
+        return orbit.model_copy(
             update={"state": OrbitState.succeeded, "bytes": entry.size, "finished_at": datetime.now(UTC)}
         )
 
@@ -363,14 +363,14 @@ def _part_frames(request: OrbitRequest) -> int:
 def _refusal(body: bytes) -> Exception:
     """What an answer of the renderer without a video means: that it may be asked again, or a problem of the video."""
     try:
-        found = Problem.model_validate_json(body)
+        problem = Problem.model_validate_json(body)
     except ValidationError:
-        found = _orbit_problem("render_failed", "The renderer answered without a problem document.")
-    if found.code not in PROBLEMS:
-        found = _orbit_problem("render_failed", found.detail)
-    if found.status >= 500 and found.code != "model_corrupt":
-        return _Delayed(found, counts=found.status != 503)
-    return ProblemError(found.code, found.detail, advice=found.advice, facts=found.facts)
+        problem = _orbit_problem("render_failed", "The renderer answered without a problem document.")
+    if problem.code not in PROBLEMS:
+        problem = _orbit_problem("render_failed", problem.detail)
+    if problem.status >= 500 and problem.code != "model_corrupt":
+        return _Delayed(problem, counts=problem.status != 503)
+    return ProblemError(problem.code, problem.detail, advice=problem.advice, facts=problem.facts)
 
 
 def _orbit_problem(code: str, detail: str) -> Problem:
@@ -378,12 +378,12 @@ def _orbit_problem(code: str, detail: str) -> Problem:
     return Problem.of(code, detail, advice=advice)
 
 
-def _failed(found: Orbit, problem: Problem) -> Orbit:
-    return found.model_copy(
+def _failed(orbit: Orbit, problem: Problem) -> Orbit:
+    return orbit.model_copy(
         update={"state": OrbitState.failed, "problem": problem, "finished_at": datetime.now(UTC)}
     )
 
 
-def _with_links(found: Orbit) -> Orbit:
-    base = address(f"/v1/models/{found.model}/orbits/{found.id}")
-    return found.model_copy(update={"links": {"self": base, "video": f"{base}/video"}})
+def _with_links(orbit: Orbit) -> Orbit:
+    base = address(f"/v1/models/{orbit.model}/orbits/{orbit.id}")
+    return orbit.model_copy(update={"links": {"self": base, "video": f"{base}/video"}})

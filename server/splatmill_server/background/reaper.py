@@ -146,12 +146,12 @@ class Reaper:
 
     def cancel(self, row: JobRow) -> bool:
         """Take the next step of a cancellation; return True once no process is left and the job has ended."""
-        found = queue.status(self.connection, row.id, row.generation)
+        status = queue.status(self.connection, row.id, row.generation)
         withdrawn = queue.withdraw(
             self.connection, row.id, row.generation
         )  # from its line even without a record
-        absent = found.state == "absent" and not self._is_restored(row.id)
-        if withdrawn or found.state in _ENDED or absent:
+        absent = status.state == "absent" and not self._is_restored(row.id)
+        if withdrawn or status.state in _ENDED or absent:
             try:
                 succeeded = self._has_succeeded(row)
             except StorageError as error:
@@ -189,16 +189,16 @@ class Reaper:
 
     def _check_one(self, row: JobRow) -> tuple[str, int] | None:
         """Repair one job. Return its mark if its attempt has ended and its final state may still arrive."""
-        found = queue.status(self.connection, row.id, row.generation)
-        if found.state == "absent":
+        status = queue.status(self.connection, row.id, row.generation)
+        if status.state == "absent":
             if not self._is_restored(row.id) and queue.enqueue(self.connection, row.id, row.generation):
                 self.metrics.requeued.inc()
                 log.warning("job was lost by the queue, enqueued again", job=row.id)
-        elif found.state in _ENDED:
+        elif status.state in _ENDED:
             mark = (row.id, row.generation)
-            if found.state == "finished" and mark not in self._unreported:
+            if status.state == "finished" and mark not in self._unreported:
                 return mark
-            self._give_up(row, found)
+            self._give_up(row, status)
         return None
 
     def _has_succeeded(self, row: JobRow) -> bool:
@@ -208,15 +208,15 @@ class Reaper:
             log.warning("job had stored its model and was not reported as succeeded", job=row.id)
         return published
 
-    def _give_up(self, row: JobRow, found: queue.QueueStatus) -> None:
+    def _give_up(self, row: JobRow, status: queue.QueueStatus) -> None:
         if self._has_succeeded(row):
             self.jobs.retire(row.id)
             return
         job = self.jobs.get(row.id)
-        facts = {"attempts": job.attempt, "stage": last_stage(job), "reason": found.reason}
+        facts = {"attempts": job.attempt, "stage": last_stage(job), "reason": status.reason}
         lost = leases.lost(self.connection, entries.rq_id(row.id, row.generation))
         during = f" during {facts['stage']}" if facts["stage"] else ""
-        if found.state == "failed" and lost >= leases.MAX_LOST:
+        if status.state == "failed" and lost >= leases.MAX_LOST:
             problem = Problem.of(
                 "attempts_exhausted",
                 f"The worker that ran the job was lost {lost} times in a row{during}, each time without a new "
@@ -225,12 +225,12 @@ class Reaper:
                 "with a smaller image_size or max_gaussians, or give the worker a limit of memory.",
                 facts=facts | {"lost_workers": lost},
             )
-        elif found.state == "failed":
+        elif status.state == "failed":
             problem = Problem.of(
                 "attempts_exhausted",
                 f"The job's process ended unexpectedly in each of {job.attempt} attempts"
                 + (f", the last time{during}" if during else "")
-                + (f" ({found.reason})" if found.reason else "")
+                + (f" ({status.reason})" if status.reason else "")
                 + ".",
                 advice="Often the machine has run out of memory: start a new job with a smaller "
                 "image_size or "
@@ -246,7 +246,7 @@ class Reaper:
             )
         if self.jobs.give_verdict(row, "failed", problem):
             self.metrics.ended.labels(problem.code).inc()
-            log.warning("job given up", job=row.id, code=problem.code, reason=found.reason)
+            log.warning("job given up", job=row.id, code=problem.code, reason=status.reason)
             self.jobs.retire(row.id)
 
 

@@ -93,16 +93,16 @@ class Sweeper:
         snapshot = self.usage.snapshot()
         self._list_missing(snapshot)
         deleted = []
-        for found in plan(snapshot, self.ages, self.usage.ledger.clock())[:MOST]:
-            if _safely(found, lambda found=found: self._delete(snapshot, found)):  # type: ignore[misc]  # bound at once
-                deleted.append(found)
+        for planned in plan(snapshot, self.ages, self.usage.ledger.clock())[:MOST]:
+            if _safely(planned, lambda record=planned: self._delete(snapshot, record)):  # type: ignore[misc]  # bound at once
+                deleted.append(planned)
                 log.info(
                     "deleted",
-                    what=found.action,
-                    id=found.held.id,
-                    owner=found.held.owner,
-                    bytes=found.bytes,
-                    reason=found.reason,
+                    what=planned.action,
+                    id=planned.held.id,
+                    owner=planned.held.owner,
+                    bytes=planned.bytes,
+                    reason=planned.reason,
                 )
         if time.monotonic() >= self._search_at:
             self._search_at = time.monotonic() + _LEFTOVERS_SECONDS
@@ -130,14 +130,14 @@ class Sweeper:
         if any(counts.values()):
             log.info("deleted leftovers", **{name: count for name, count in counts.items() if count})
 
-    def _delete(self, snapshot: Snapshot, found: Planned) -> bool:
+    def _delete(self, snapshot: Snapshot, planned: Planned) -> bool:
         """Delete one record, unless it was used since the plan was made. Return whether it was deleted."""
 
         def due() -> bool:
-            return self._is_due(snapshot, found)
+            return self._is_due(snapshot, planned)
 
-        record_id = found.held.id
-        match found.action:
+        record_id = planned.held.id
+        match planned.action:
             case "capture":
                 return self.deletion.capture(record_id, due)
             case "job":
@@ -145,29 +145,29 @@ class Sweeper:
             case "work":
                 return self.deletion.work(record_id, due)
             case "orphan":
-                return self.deletion.orphan(found.held, due)
+                return self.deletion.orphan(planned.held, due)
 
-    def _is_due(self, snapshot: Snapshot, found: Planned) -> bool:
+    def _is_due(self, snapshot: Snapshot, planned: Planned) -> bool:
         """Return whether the folder is as old as planned, now that no job can begin to use it."""
-        held, now = found.held, self.usage.ledger.clock()
-        seen = sums(self.storage.walk(held.folder)).get((held.kind, held.id), held)
+        held, now = planned.held, self.usage.ledger.clock()
+        current = sums(self.storage.walk(held.folder)).get((held.kind, held.id), held)
         # Times of modification are whole seconds in a bucket.
-        before, after = ((at.modified, at.files, at.size) for at in (held, seen))
-        if before != after or now < found.due:
+        before, after = ((at.modified, at.files, at.size) for at in (held, current))
+        if before != after or now < planned.due:
             return False
-        if found.action == "orphan":
-            return not seen.whole
+        if planned.action == "orphan":
+            return not current.whole
         uses = unfinished_jobs(self.connection)
-        if found.action in ("capture", "job") and any(not use.readable for use in uses):
+        if planned.action in ("capture", "job") and any(not use.readable for use in uses):
             return False
         if held.kind is StoredKind.capture:
             return not self.usage.ledger.arriving(held.owner or "", held.id, now)
-        if held.kind is StoredKind.job and found.action == "job":
+        if held.kind is StoredKind.job and planned.action == "job":
             return not self.storage.exists(layout.job_record(held.id))  # it has a model since
         return True
 
 
-def _safely(found: Planned, delete: Callable[[], bool]) -> bool:
+def _safely(planned: Planned, delete: Callable[[], bool]) -> bool:
     """Return the result of a deletion. What refuses it is logged, so that it does not keep others from being deleted.
 
     Raises redis.RedisError, which affects all.
@@ -175,7 +175,7 @@ def _safely(found: Planned, delete: Callable[[], bool]) -> bool:
     try:
         return delete()
     except ProblemError as error:
-        log.info("not deleted", what=found.action, id=found.held.id, why=error.problem.detail)
+        log.info("not deleted", what=planned.action, id=planned.held.id, why=error.problem.detail)
     except StorageError as error:
-        log.warning("cannot be deleted", what=found.action, id=found.held.id, error=str(error))
+        log.warning("cannot be deleted", what=planned.action, id=planned.held.id, error=str(error))
     return False

@@ -45,12 +45,12 @@ Row = Mapping[bytes, bytes]
 class Batch:
     """What was read of a job at once: its row, and after it the new events.
 
-    found: the events in the order of time, each with the number of its stream in `events.BOUNDS`.
+    events: those of the job in the order of time, each with the number of its stream in `events.BOUNDS`.
     end: the last entry of each stream.
     """
 
     row: Row
-    found: Sequence[tuple[StoredEvent, int]]
+    events: Sequence[tuple[StoredEvent, int]]
     end: Sequence[str]
 
 
@@ -220,7 +220,7 @@ class Feed:
             if job is None or job.entries is not entries:
                 continue  # everybody has left meanwhile
             batch = _batch(name, row, reply, entries)
-            if batch.found or list(batch.end) != list(entries) or row != job.row:
+            if batch.events or list(batch.end) != list(entries) or row != job.row:
                 job.entries, job.row = list(batch.end), row
                 for subscription in job.subscriptions:
                     subscription.put(batch)
@@ -239,7 +239,7 @@ class Feed:
             for stream, entry in zip(events.BOUNDS, entries[job_id], strict=True)
         }
         reply: Any = await self._redis.xread(positions, block=block)
-        return rows, {name.decode(): found for name, found in reply or []}
+        return rows, {name.decode(): new_entries for name, new_entries in reply or []}
 
 
 def is_beyond(entry: str, end: str) -> bool:
@@ -254,8 +254,8 @@ def _batch(job_id: str, row: Row, reply: Mapping[str, Any], entries: Sequence[st
         for number, name in enumerate(stream(job_id) for stream in events.BOUNDS)
     ]
     # The order within each stream is kept.
-    found = list(heapq.merge(*read, key=lambda found: events.time_order(found[0])))
-    return Batch(row, found, _end(job_id, reply, entries))
+    merged = list(heapq.merge(*read, key=lambda merged: events.time_order(merged[0])))
+    return Batch(row, merged, _end(job_id, reply, entries))
 
 
 def _end(job_id: str, reply: Mapping[str, Any], entries: Sequence[str]) -> list[str]:

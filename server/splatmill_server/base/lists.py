@@ -89,11 +89,11 @@ class Lists:
         At most SCANNED records are looked at; a page then holds fewer than `limit`, and has a cursor all the same.
         Raises problems for a cursor that is not valid (422), and while the lists are being made (503).
         """
-        found: list[tuple[int, str, T]] = []
+        records: list[tuple[int, str, T]] = []
         after = read_cursor(cursor) if cursor is not None else None
         scanned, ended = 0, False
         size = max(limit + 1, BATCH) if narrowed else limit + 1
-        while len(found) <= limit and scanned < SCANNED and not ended:
+        while len(records) <= limit and scanned < SCANNED and not ended:
             batch = self.newest(names, after, size)
             ended = len(batch) < size
             scanned += len(batch)
@@ -101,19 +101,19 @@ class Lists:
             after = batch[-1] if batch else after
             moments = {record_id: moment for moment, record_id in batch}
             left = likely(list(moments)) if likely is not None else list(moments)
-            while left and len(found) <= limit:
-                together = limit + 1 - len(found) if likely is not None else len(left)
+            while left and len(records) <= limit:
+                together = limit + 1 - len(records) if likely is not None else len(left)
                 admitted = read(left[:together])
-                found += [
+                records += [
                     (moments[name], name, admitted[name]) for name in left[:together] if name in admitted
                 ]
                 left = left[together:]
         following = None
-        if len(found) > limit:
-            following = write_cursor(*found[limit - 1][:2])
+        if len(records) > limit:
+            following = write_cursor(*records[limit - 1][:2])
         elif not ended and after is not None:
             following = write_cursor(*after)
-        return [record for _, _, record in found[:limit]], following
+        return [record for _, _, record in records[:limit]], following
 
     def newest(
         self, names: Sequence[str], after: tuple[int, str] | None, count: int
@@ -176,12 +176,12 @@ class Lists:
 
     def missing(self, kind: lists.Kind, record_ids: Sequence[str]) -> list[str]:
         """Return those of the records that are not listed."""
-        found = []
+        unlisted = []
         for start in range(0, len(record_ids), _TOGETHER):
             batch = record_ids[start : start + _TOGETHER]
             scores = self.connection.zmscore(lists.name(kind), list(batch))
-            found += [name for name, score in zip(batch, scores, strict=True) if score is None]
-        return found
+            unlisted += [name for name, score in zip(batch, scores, strict=True) if score is None]
+        return unlisted
 
     def records(self, kind: lists.Kind, record_ids: Sequence[str]) -> dict[str, bytes | None]:
         """Return what is kept of these records for lists, by id."""

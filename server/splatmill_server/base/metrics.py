@@ -117,8 +117,8 @@ class Metrics:
 class _Joined(Collector):
     """Metrics of several sources."""
 
-    def __init__(self, found: list[Metric]) -> None:
-        self._found = found
+    def __init__(self, metrics: list[Metric]) -> None:
+        self._metrics = metrics
 
     def collect(self) -> Iterator[Metric]:
-        yield from self._found
+        yield from self._metrics

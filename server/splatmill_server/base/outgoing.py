@@ -70,12 +70,12 @@ class Answer:
 
     async def beginning(self, limit: int) -> bytes:
         """Return the first bytes of the body, at most `limit`."""
-        found = b""
+        first = b""
         async for chunk in self.chunks:
-            found += chunk
-            if len(found) >= limit:
+            first += chunk
+            if len(first) >= limit:
                 break
-        return found[:limit]
+        return first[:limit]
 
 
 class Outgoing:
@@ -128,7 +128,7 @@ class Outgoing:
         """Resolve a name. Raises AddressRefused if any of its addresses is not public, and NoAnswer if it has none."""
         loop = asyncio.get_running_loop()
         try:
-            found = await asyncio.wait_for(
+            answers = await asyncio.wait_for(
                 loop.getaddrinfo(host, port, type=socket.SOCK_STREAM), CONNECT_SECONDS
             )
         except TimeoutError as error:
@@ -137,7 +137,7 @@ class Outgoing:
             ) from error
         except (OSError, ValueError) as error:
             raise NoAnswer(f"The name {host} cannot be resolved.") from error
-        addresses = list(dict.fromkeys(str(entry[4][0]) for entry in found))
+        addresses = list(dict.fromkeys(str(entry[4][0]) for entry in answers))
         if not addresses:
             raise NoAnswer(f"The name {host} has no address.")
         if not self._allows(host, port):
@@ -194,11 +194,11 @@ class Outgoing:
                         )
                     )
                 try:
-                    found = {k.decode("latin-1").lower(): v.decode("latin-1") for k, v in response.headers}
+                    fields = {k.decode("latin-1").lower(): v.decode("latin-1") for k, v in response.headers}
                     if response.status in _REDIRECTS and redirects:
-                        target = self._redirected(target, found.get("location", ""), left)
+                        target = self._redirected(target, fields.get("location", ""), left)
                         continue
-                    yield Answer(response.status, found, str(target), _body(response, target))
+                    yield Answer(response.status, fields, str(target), _body(response, target))
                     return
                 finally:
                     await response.aclose()

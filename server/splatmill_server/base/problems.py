@@ -45,10 +45,10 @@ class ProblemError(HTTPException):
 
     def about_file(self, name: str) -> "ProblemError":
         """Return the same error with the name of the file that it concerns, in the detail and among the facts."""
-        found = self.problem
-        detail = found.detail if name in found.detail else f"{name}: {found.detail}"
-        facts = found.facts | {"file": name}
-        return ProblemError(found.code, detail, advice=found.advice, facts=facts, headers=self.headers)
+        problem = self.problem
+        detail = problem.detail if name in problem.detail else f"{name}: {problem.detail}"
+        facts = problem.facts | {"file": name}
+        return ProblemError(problem.code, detail, advice=problem.advice, facts=facts, headers=self.headers)
 
 
 class ProblemResponse(Response):
@@ -192,8 +192,8 @@ def storage_trouble(error: StorageError) -> str:
     return f"{error.summary.removesuffix('.')}; {LOGGED}."
 
 
-def body_cut_off(seen: int | None = None, announced: int | None = None) -> Problem:
+def body_cut_off(received: int | None = None, announced: int | None = None) -> Problem:
     """Return the problem for a connection that ended before the body did."""
-    facts = {} if seen is None else {"received": seen, "announced": announced}
+    facts = {} if received is None else {"received": received, "announced": announced}
     detail = "The body ended before its announced length; nothing was stored."
     return Problem.of("body_cut_off", detail, advice="Send the request again.", facts=facts)

@@ -63,8 +63,8 @@ def no_renderer() -> ProblemError:
 
 def _request_id() -> dict[str, str]:
     """Return the header with the id of the request that is being answered, for the log of the renderer."""
-    found = structlog.contextvars.get_contextvars().get("request")
-    return {rendering.REQUEST_HEADER: found} if found else {}
+    request_id = structlog.contextvars.get_contextvars().get("request")
+    return {rendering.REQUEST_HEADER: request_id} if request_id else {}
 
 
 class CountingTransport(httpx.AsyncBaseTransport):

@@ -50,7 +50,7 @@ _FROM_ZERO: dict[str, tuple[tuple[str, ...], ...]] = {
 
 
 @dataclass(frozen=True)
-class Seen:
+class RedisValues:
     """The values in Redis at a scrape.
 
     now: time by the clock of Redis, seconds since 1970.
@@ -77,7 +77,7 @@ class Seen:
     scanned: float | None
 
 
-def read(connection: redis.Redis) -> Seen:
+def read(connection: redis.Redis) -> RedisValues:
     """Return the values in Redis, in one round trip, and one more for the workers. Raises redis.RedisError."""
     with connection.pipeline(transaction=False) as pipe:
         pipe.time()
@@ -93,7 +93,7 @@ def read(connection: redis.Redis) -> Seen:
         pipe.hget(keys.SCAN, "ended")
         replies = pipe.execute()
     (seconds, micros), waiting, oldest, known, info, stored_totals, *counts, active, held, scanned = replies
-    return Seen(
+    return RedisValues(
         now=seconds + micros / 1e6,
         waiting=lines.answered(waiting),
         oldest=float(oldest[0][1]) if oldest else None,
@@ -107,17 +107,17 @@ def read(connection: redis.Redis) -> Seen:
     )
 
 
-def families(seen: Seen | None) -> Iterator[Metric]:
+def families(values: RedisValues | None) -> Iterator[Metric]:
     """Yield the metrics, in which there are no values if Redis did not answer, but that it did not."""
     yield GaugeMetricFamily(
-        "splatmill_redis_up", f"1 if Redis answers, else 0. {SMALLEST}", value=0 if seen is None else 1
+        "splatmill_redis_up", f"1 if Redis answers, else 0. {SMALLEST}", value=0 if values is None else 1
     )
-    yield from _of_queue(seen)
-    yield from _of_workers(seen)
-    yield from _of_storage(seen)
-    yield from _of_redis(seen)
+    yield from _of_queue(values)
+    yield from _of_workers(values)
+    yield from _of_storage(values)
+    yield from _of_redis(values)
     for total in totals.TOTALS:
-        yield _family(total, seen.counted[total.name] if seen is not None else None)
+        yield _family(total, values.counted[total.name] if values is not None else None)
 
 
 def of_disk(spare: int | None) -> Iterator[Metric]:
@@ -149,7 +149,7 @@ def of_renderer(state: RendererState | None) -> Iterator[Metric]:
     yield from (up, admitted, cached)
 
 
-def _of_queue(seen: Seen | None) -> Iterator[Metric]:
+def _of_queue(values: RedisValues | None) -> Iterator[Metric]:
     length = _gauge("splatmill_queue_length", "Jobs that wait for a worker.", "queue")
     serving = _gauge("splatmill_queue_workers", "Workers that serve a queue.", "queue")
     oldest = _gauge(
@@ -157,16 +157,16 @@ def _of_queue(seen: Seen | None) -> Iterator[Metric]:
         "Seconds that the job has waited which has waited longest; 0 if none waits.",
     )
     unfinished = _gauge("splatmill_jobs_unfinished", "Jobs that have not ended, those that wait among them.")
-    if seen is not None:
+    if values is not None:
         for line in LINES:
-            length.add_metric([line], seen.waiting.count(line))
-            serving.add_metric([line], len(workers.serving(seen.listening, line)))
-        oldest.add_metric([], 0.0 if seen.oldest is None else max(0.0, seen.now - seen.oldest))
-        unfinished.add_metric([], seen.unfinished)
+            length.add_metric([line], values.waiting.count(line))
+            serving.add_metric([line], len(workers.serving(values.listening, line)))
+        oldest.add_metric([], 0.0 if values.oldest is None else max(0.0, values.now - values.oldest))
+        unfinished.add_metric([], values.unfinished)
     yield from (length, serving, oldest, unfinished)
 
 
-def _of_workers(seen: Seen | None) -> Iterator[Metric]:
+def _of_workers(values: RedisValues | None) -> Iterator[Metric]:
     states = _gauge(
         "splatmill_workers", "Registered workers: idle, busy, suspended (disk full), other.", "state"
     )
@@ -178,44 +178,44 @@ def _of_workers(seen: Seen | None) -> Iterator[Metric]:
         "splatmill_worker_disk_spare_bytes",
         "Bytes that are free beyond the reserve on the disk of the worker that has least; at 0 it takes no jobs.",
     )
-    if seen is not None:
+    if values is not None:
         counts = Counter(dict.fromkeys(_STATES, 0))
-        counts.update(worker.state if worker.state in _STATES else "other" for worker in seen.listening)
+        counts.update(worker.state if worker.state in _STATES else "other" for worker in values.listening)
         for state, count in counts.items():
             states.add_metric([state], count)
-        beats = [worker.last_heartbeat for worker in seen.listening if worker.last_heartbeat is not None]
+        beats = [worker.last_heartbeat for worker in values.listening if worker.last_heartbeat is not None]
         if beats:
-            age.add_metric([], max(0.0, seen.now - min(beats).timestamp()))
-        spares = [worker.spare for worker in seen.listening if worker.spare is not None]
+            age.add_metric([], max(0.0, values.now - min(beats).timestamp()))
+        spares = [worker.spare for worker in values.listening if worker.spare is not None]
         if spares:
             spare.add_metric([], min(spares))
     yield from (states, age, spare)
 
 
-def _of_storage(seen: Seen | None) -> Iterator[Metric]:
+def _of_storage(values: RedisValues | None) -> Iterator[Metric]:
     records = _gauge("splatmill_records", "Captures, jobs and models.", "kind")
     stored = _gauge(
         "splatmill_stored_bytes", "Bytes that all owners hold in storage, by the last scan of it."
     )
     scan = _gauge("splatmill_storage_scan_age_seconds", "Seconds since the last scan of storage ended.")
-    if seen is not None:
-        for kind, count in seen.records.items():
+    if values is not None:
+        for kind, count in values.records.items():
             records.add_metric([kind], count)
-        stored.add_metric([], seen.stored)
-        if seen.scanned is not None:
-            scan.add_metric([], max(0.0, seen.now - seen.scanned))
+        stored.add_metric([], values.stored)
+        if values.scanned is not None:
+            scan.add_metric([], max(0.0, values.now - values.scanned))
     yield from (records, stored, scan)
 
 
-def _of_redis(seen: Seen | None) -> Iterator[Metric]:
+def _of_redis(values: RedisValues | None) -> Iterator[Metric]:
     used = _gauge("splatmill_redis_memory_bytes", "Bytes of memory that Redis uses.")
     limit = _gauge(
         "splatmill_redis_memory_limit_bytes",
         "Bytes of memory at which Redis takes no more writes; 0 if there is no limit.",
     )
-    if seen is not None:
-        used.add_metric([], seen.memory.used)
-        limit.add_metric([], seen.memory.limit or 0)
+    if values is not None:
+        used.add_metric([], values.memory.used)
+        limit.add_metric([], values.memory.limit or 0)
     yield from (used, limit)
 
 
@@ -235,15 +235,15 @@ def _family(total: Total, counted: Counted | None) -> Metric:
     histogram = HistogramMetricFamily(total.name, text, labels=total.labels)
     if counted is None:
         return histogram
-    for labels, found in sorted(counted.distributions.items(), key=lambda item: item[0]):
-        histogram.add_metric(labels, _buckets(total, found), found.sum)
+    for labels, distribution in sorted(counted.distributions.items(), key=lambda item: item[0]):
+        histogram.add_metric(labels, _buckets(total, distribution), distribution.sum)
     return histogram
 
 
-def _buckets(total: Total, found: Distribution) -> list[tuple[str, float]]:
+def _buckets(total: Total, distribution: Distribution) -> list[tuple[str, float]]:
     """Return the upper bound and the number of observations up to it, by bucket."""
     below, buckets = 0, []
-    for bound, count in zip((*total.bounds, float("inf")), found.counts, strict=True):
+    for bound, count in zip((*total.bounds, float("inf")), distribution.counts, strict=True):
         below += count
         buckets.append((str(float(bound)) if bound < float("inf") else "+Inf", float(below)))
     return buckets

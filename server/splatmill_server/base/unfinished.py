@@ -132,12 +132,12 @@ class Unfinished:
         """Return the lines of all pieces by their names, in the order in which they were asked for."""
         marks = sorted(self._storage.entries(self._folder), key=lambda entry: entry.modified)
         names = [entry.path.rsplit("/", 1)[-1] for entry in marks]
-        found = {
+        marked = {
             name: self.line_of(name) for name in names if all(layout.is_id(part) for part in name.split("."))
         }
         running = [*self.running]  # copied at once: the event loop changes it meanwhile
-        self._lines = found | {name: self._lines[name] for name in running if name in self._lines}
-        return found
+        self._lines = marked | {name: self._lines[name] for name in running if name in self._lines}
+        return marked
 
     async def _run(self, name: str) -> None:
         rest = self._look_seconds  # where another process works on it, or nobody can now

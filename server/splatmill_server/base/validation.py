@@ -22,8 +22,8 @@ def problem_of_validation(errors: Sequence[Any]) -> Problem:
         )
         return Problem.of("malformed_body", detail, advice="Send one JSON object.", facts=facts)
     for error in errors:
-        if (found := _named(error)) is not None:
-            code, detail, advice = found
+        if (problem := _named(error)) is not None:
+            code, detail, advice = problem
             return Problem.of(code, detail, advice=advice, facts=facts)
     shown = "; ".join(f"{_path(error)}: {error['msg']}" for error in errors[:3])
     return Problem.of("invalid_request", f"The request does not match the schema: {shown}.", facts=facts)
@@ -32,7 +32,7 @@ def problem_of_validation(errors: Sequence[Any]) -> Problem:
 def _named(error: Any) -> tuple[str, str, str | None] | None:
     """Return code, detail and advice of an error with a specific code, or None."""
     loc = [str(part) for part in error["loc"] if part != "body"]
-    field, kind, given = (loc[-1] if loc else ""), error["type"], error.get("input")
+    field, kind, value = (loc[-1] if loc else ""), error["type"], error.get("input")
     if loc[:1] == ["options"] and len(loc) > 1:
         if kind == "extra_forbidden":
             near = difflib.get_close_matches(field, TrainOptions.model_fields, n=1)
@@ -43,16 +43,16 @@ def _named(error: Any) -> tuple[str, str, str | None] | None:
                 advice or "List the options with GET /v1/options.",
             )
         if kind in _RANGE:
-            detail = f"The option {loc[1]!r} cannot be {_short(given)}: {_sentence(error)}"
+            detail = f"The option {loc[1]!r} cannot be {_short(value)}: {_sentence(error)}"
             return "option_out_of_range", detail, "List the accepted values with GET /v1/options."
         return None
     if field in _SIZES and kind != "missing":
-        detail = f"The {field} of the image cannot be {_short(given)}: {_sentence(error)}"
+        detail = f"The {field} of the image cannot be {_short(value)}: {_sentence(error)}"
         limits = (
             f"Give sides of 1 to {MAX_RENDER_SIDE} pixels, and at most {MAX_RENDER_PIXELS} pixels in all."
         )
         return "size_out_of_range", detail, limits
-    if isinstance(given, dict) and kind == "value_error" and _pixels(given) > MAX_RENDER_PIXELS:
+    if isinstance(value, dict) and kind == "value_error" and _pixels(value) > MAX_RENDER_PIXELS:
         return "size_out_of_range", _sentence(error), "Request a smaller image."
     if _LENS & set(loc):
         return "camera_invalid", f"The camera is not valid: {_sentence(error)}", None

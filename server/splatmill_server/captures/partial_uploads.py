@@ -367,27 +367,27 @@ async def _named(file: str) -> AsyncIterator[None]:
         raise error.about_file(file) from error
     except StorageError as error:
         log.warning("storage error", error=str(error), file=file)
-        found = problem_of_storage(error)
-        problem = ProblemError(found.code, found.detail, advice=found.advice, facts=found.facts)
+        original = problem_of_storage(error)
+        problem = ProblemError(original.code, original.detail, advice=original.advice, facts=original.facts)
         raise problem.about_file(file) from error
 
 
-def _wrong_offset(given: int, held: int) -> ProblemError:
+def _wrong_offset(offset: int, held: int) -> ProblemError:
     return ProblemError(
         "upload_offset_differs",
-        f"The body begins at byte {given}, but the server holds {held} bytes.",
+        f"The body begins at byte {offset}, but the server holds {held} bytes.",
         advice=f"Send the file from byte {held} on.",
-        facts={"provided-offset": given, "expected-offset": held},
+        facts={"provided-offset": offset, "expected-offset": held},
         headers={UPLOAD_OFFSET: str(held), UPLOAD_COMPLETE: write_boolean(False)},
     )
 
 
-def _wrong_length(expected: int, seen: int, *, offset: int | None = None) -> ProblemError:
+def _wrong_length(expected: int, length: int, *, offset: int | None = None) -> ProblemError:
     return ProblemError(
         "upload_length_differs",
-        f"The file was announced with {expected} bytes; this request would make it {seen} bytes long.",
+        f"The file was announced with {expected} bytes; this request would make it {length} bytes long.",
         advice="Begin again with the right Upload-Length, or send the missing bytes.",
-        facts={"announced": expected, "seen": seen},
+        facts={"announced": expected, "seen": length},
         headers={} if offset is None else {UPLOAD_OFFSET: str(offset), UPLOAD_COMPLETE: write_boolean(False)},
     )
 
@@ -414,6 +414,8 @@ def _completed(stored: CaptureFile) -> ProblemError:
 
 def _after_completion(error: ProblemError) -> ProblemError:
     """Return the error with the header that says: all bytes arrived, and going on with the upload will not help."""
-    found = error.problem
+    problem = error.problem
     headers = {**(error.headers or {}), UPLOAD_COMPLETE: write_boolean(True)}
-    return ProblemError(found.code, found.detail, advice=found.advice, facts=found.facts, headers=headers)
+    return ProblemError(
+        problem.code, problem.detail, advice=problem.advice, facts=problem.facts, headers=headers
+    )

@@ -86,9 +86,9 @@ class Captures:
             ids = [_id_of_key(owner, key, number) for number in range(_IDS_OF_KEY)]
             for known in ids:
                 if self.storage.exists(layout.capture_record(known)):
-                    found = self.get(known)
-                    self._list_new(found)  # whoever made it may have been killed before that
-                    return found, False
+                    existing = self.get(known)
+                    self._list_new(existing)  # whoever made it may have been killed before that
+                    return existing, False
             capture_id = next((known for known in ids if not self._is_leftover(known)), capture_id)
         capture = Capture(id=capture_id, name=name, owner=owner, created_at=datetime.now(UTC))
         record = json.dumps(capture.model_dump(mode="json", exclude={"files"}) | {"format": FORMAT}).encode()
@@ -117,8 +117,8 @@ class Captures:
     def _is_leftover(self, capture_id: str) -> bool:
         """Return whether there are files without a record: the capture is being deleted, and new files would go too."""
         # The files are looked for first: a record that another request is just making comes with the first file.
-        found = any(True for _ in self.storage.entries(layout.capture(capture_id)))
-        return found and not self.storage.exists(layout.capture_record(capture_id))
+        has_files = any(True for _ in self.storage.entries(layout.capture(capture_id)))
+        return has_files and not self.storage.exists(layout.capture_record(capture_id))
 
     def get(self, capture_id: str) -> Capture:
         """Return the record without the files. Raises a 404 problem, and UnreadableRecord."""
@@ -157,20 +157,22 @@ class Captures:
         """Return the record with all files and their digests. Raises a 404 problem."""
         capture = await run_in_threadpool(self.get, capture_id)
         folder = layout.capture_files(capture_id)
-        found = await run_in_threadpool(lambda: list(self.storage.entries(folder)))
-        return capture.model_copy(update={"files": await self.digests.of_all(capture, found)})
+        entries = await run_in_threadpool(lambda: list(self.storage.entries(folder)))
+        return capture.model_copy(update={"files": await self.digests.of_all(capture, entries)})
 
-    def list(self, cursor: str | None, limit: int, wanted: Filter | None = None) -> CapturePage:
-        """Return a page of the captures that `wanted` admits, newest first. Raises the problems of `Lists.page`."""
-        wanted = wanted or Filter()
+    def list(self, cursor: str | None, limit: int, only: Filter | None = None) -> CapturePage:
+        """Return a page of the captures that `only` admits, newest first. Raises the problems of `Lists.page`."""
+        only = only or Filter()
 
         def read(capture_ids: Sequence[str]) -> dict[str, Capture]:
-            found = self._listed(capture_ids)
+            captures = self._listed(capture_ids)
             return {
-                name: capture for name, capture in found.items() if wanted.admits(capture.owner, capture.name)
+                name: capture
+                for name, capture in captures.items()
+                if only.admits(capture.owner, capture.name)
             }
 
-        names, narrowed = [lists.name("captures", owner=wanted.owner)], wanted.name is not None
+        names, narrowed = [lists.name("captures", owner=only.owner)], only.name is not None
         captures, following = self.lists.page(names, cursor, limit, read, narrowed=narrowed)
         return CapturePage(captures=captures, cursor=following)
 
@@ -180,14 +182,14 @@ class Captures:
         missing = [name for name, record in kept.items() if record is None]
         stored = dict(zip(missing, each(self._stored, missing), strict=True))
         self.lists.keep("captures", {name: record for name, record in stored.items() if record is not None})
-        found = {}
+        captures = {}
         for capture_id, record in (kept | stored).items():
             try:
                 if record is not None:  # else it is being made or deleted
-                    found[capture_id] = _read(record, capture_id)
+                    captures[capture_id] = _read(record, capture_id)
             except UnreadableRecord as error:
                 warn(f"capture {capture_id} is not listed", str(error))
-        return found
+        return captures
 
     def _stored(self, capture_id: str) -> bytes | None:
         try:
@@ -214,9 +216,9 @@ class Captures:
     def list_missing(self, capture_ids: Sequence[str]) -> int:
         """List those of these captures that no list holds, because Redis was away, and return their number."""
         missing = self.lists.missing("captures", capture_ids)
-        found = self._listed(missing)
-        self._list(list(found.values()))
-        return len(found)
+        captures = self._listed(missing)
+        self._list(list(captures.values()))
+        return len(captures)
 
     def make_lists(self, succeeded: object = None) -> int:
         """List all captures in storage, and return their number (see `Lists.makers`)."""
@@ -225,12 +227,12 @@ class Captures:
         ids = self.storage.children(layout.captures())
         count = 0
         for start in range(0, len(ids), _LISTED_TOGETHER):
-            found = self._listed(ids[start : start + _LISTED_TOGETHER])
-            self._list(list(found.values()))
-            for capture_id in self.lists.deleted(StoredKind.capture, list(found)):
+            captures = self._listed(ids[start : start + _LISTED_TOGETHER])
+            self._list(list(captures.values()))
+            for capture_id in self.lists.deleted(StoredKind.capture, list(captures)):
                 if not self.storage.exists(layout.capture_record(capture_id)):
-                    self.unlist(capture_id, found[capture_id].owner)
-            count += len(found)
+                    self.unlist(capture_id, captures[capture_id].owner)
+            count += len(captures)
         return count
 
     def delete(self, capture_id: str) -> None:

@@ -24,11 +24,11 @@ def estimate(request: EstimateJob, finished: Sequence[Figures]) -> Estimate:
         fits the option `backend` are not used, nor those of other kernels.
     """
     backend = request.options.backend
-    fitting = [found for found in finished if backend is Backend.auto or found.kernels == backend.value]
+    fitting = [figures for figures in finished if backend is Backend.auto or figures.kernels == backend.value]
     here = [
-        found
-        for found in fitting
-        if (found.machine, found.kernels) == (fitting[0].machine, fitting[0].kernels)
+        figures
+        for figures in fitting
+        if (figures.machine, figures.kernels) == (fitting[0].machine, fitting[0].kernels)
     ]
     stages = [_cameras(request, here), _training(request, here), _rest(request, here)]
     return Estimate(
@@ -43,13 +43,13 @@ def estimate(request: EstimateJob, finished: Sequence[Figures]) -> Estimate:
 
 def _cameras(request: EstimateJob, here: Sequence[Figures]) -> StageEstimate:
     alike = _nearest(
-        [found for found in here if found.posed == request.posed],
-        lambda found: _ratio(found.photos, request.photos),
+        [figures for figures in here if figures.posed == request.posed],
+        lambda figures: _ratio(figures.photos, request.photos),
     )
     kind = "with cameras that came with the photos" if request.posed else "with recovered cameras"
     if not alike:
         return StageEstimate(stage="cameras", because=f"No job {kind} has finished on this server yet.")
-    each = [found.cameras / found.photos for found in alike]
+    each = [figures.cameras / figures.photos for figures in alike]
     return _stage(
         "cameras",
         [seconds * request.photos for seconds in each],
@@ -67,10 +67,10 @@ def _training(request: EstimateJob, here: Sequence[Figures]) -> StageEstimate:
         return _stage("training", [limit], f"The time budget is {limit:g} s.")
     alike = _nearest(
         here,
-        lambda found: (
-            _ratio(found.photos, request.photos)
-            + 0.5 * _ratio(found.steps, steps)
-            + _size_distance(found, options)
+        lambda figures: (
+            _ratio(figures.photos, request.photos)
+            + 0.5 * _ratio(figures.steps, steps)
+            + _size_distance(figures, options)
         ),
     )
     if not alike and limit < math.inf:
@@ -79,7 +79,7 @@ def _training(request: EstimateJob, here: Sequence[Figures]) -> StageEstimate:
         )
     if not alike:
         return StageEstimate(stage="training", because="No such job has finished on this server yet.")
-    each = [found.train / found.steps * _size_factor(found, options) for found in alike]
+    each = [figures.train / figures.steps * _size_factor(figures, options) for figures in alike]
     ends_early = options.steps is None or options.target_psnr is not None
     at_most = ", at most, since training may end earlier" if ends_early else ""
     return _stage(
@@ -90,14 +90,14 @@ def _training(request: EstimateJob, here: Sequence[Figures]) -> StageEstimate:
 
 
 def _rest(request: EstimateJob, here: Sequence[Figures]) -> StageEstimate:
-    alike = _nearest(here, lambda found: _ratio(found.photos, request.photos))
+    alike = _nearest(here, lambda figures: _ratio(figures.photos, request.photos))
     if not alike:
         return StageEstimate(stage="rest", because="No job has finished on this server yet.")
     return _stage(
         "rest",
-        [found.fixed + found.by_photo / found.photos * request.photos for found in alike],
-        f"{_jobs(alike)} took {_digits(median([found.fixed for found in alike]))} s to start, plan and store, "
-        f"and {_digits(median([found.by_photo / found.photos for found in alike]))} s per photo to load and measure.",
+        [figures.fixed + figures.by_photo / figures.photos * request.photos for figures in alike],
+        f"{_jobs(alike)} took {_digits(median([each.fixed for each in alike]))} s to start, plan and store, "
+        f"and {_digits(median([each.by_photo / each.photos for each in alike]))} s per photo to load and measure.",
     )
 
 
@@ -110,17 +110,17 @@ def steps_of(options: TrainOptions, photos: int) -> int | None:
     return preset_steps(options.ending, photos)
 
 
-def _size_distance(found: Figures, options: TrainOptions) -> float:
+def _size_distance(figures: Figures, options: TrainOptions) -> float:
     if options.image_size is not None:
-        return _ratio(found.image_size, options.image_size)
-    return OTHER_PRESET if found.sized or found.preset != options.preset.value else 0.0
+        return _ratio(figures.image_size, options.image_size)
+    return OTHER_PRESET if figures.sized or figures.preset != options.preset.value else 0.0
 
 
-def _size_factor(found: Figures, options: TrainOptions) -> float:
+def _size_factor(figures: Figures, options: TrainOptions) -> float:
     """How much longer a step takes at another size of the photos: the share that is spent on pixels grows with them."""
     if options.image_size is None:
         return 1.0
-    return 1.0 + found.pixel_share * ((options.image_size / found.image_size) ** 2 - 1.0)
+    return 1.0 + figures.pixel_share * ((options.image_size / figures.image_size) ** 2 - 1.0)
 
 
 def _nearest(figures: Sequence[Figures], distance: Callable[[Figures], float]) -> list[Figures]:

@@ -66,7 +66,7 @@ class Finished:
         # Without a lock, which a storage that does not answer would hold: two threads may read the same report.
         known = self._known
         self._known = read = {key: known[key] if key in known else self._read(key[1]) for key in newest}
-        return [found for found in read.values() if found is not None]
+        return [figures for figures in read.values() if figures is not None]
 
     def _read(self, model_id: str) -> Figures | None:
         try:
@@ -90,7 +90,7 @@ def figures(job: Mapping[str, Any], report: Mapping[str, Any]) -> Figures | None
     recovered = sum(map(float, (report.get("sfm") or {}).get("seconds", {}).values()))
     by_photo = float(seconds.get("load", 0.0)) + float(seconds["evaluate"])
     rest = wall - float(seconds["sfm"]) - float(seconds["train"]) - by_photo
-    found = Figures(
+    figures_of_job = Figures(
         photos=int(facts["views"]) + int(facts["held_out"]),
         posed=facts["source"] != "sfm",
         preset=str(options.get("preset", "balanced")),
@@ -105,7 +105,11 @@ def figures(job: Mapping[str, Any], report: Mapping[str, Any]) -> Figures | None
         fixed=max(0.0, rest - float(seconds.get("film", 0.0))),
         pixel_share=_pixel_share(facts, int(report["result"]["gaussians"])),
     )
-    return found if found.photos > 0 and found.steps > 0 and found.image_size > 0 else None
+    return (
+        figures_of_job
+        if figures_of_job.photos > 0 and figures_of_job.steps > 0 and figures_of_job.image_size > 0
+        else None
+    )
 
 
 def _pixel_share(facts: Mapping[str, Any], gaussians: int) -> float:

@@ -50,44 +50,44 @@ def page(
     places: QueuePlaces,
     cursor: str | None,
     limit: int,
-    wanted: JobFilter,
+    only: JobFilter,
 ) -> JobPage:
-    """Return a page of the jobs that `wanted` admits, newest first. Raises the problems of `Lists.page`."""
+    """Return a page of the jobs that `only` admits, newest first. Raises the problems of `Lists.page`."""
 
     def likely(job_ids: Sequence[str]) -> list[str]:
-        return _likely(connection, job_ids, wanted)
+        return _likely(connection, job_ids, only)
 
     def read(job_ids: Sequence[str]) -> Mapping[str, Held]:
         held = read_jobs(connection, job_ids)
         return {
-            job_id: found
-            for job_id, found in held.items()
-            if wanted.admits(found.row.owner, found.row.name)
-            and (wanted.states is None or found.state in wanted.states)
+            job_id: held_job
+            for job_id, held_job in held.items()
+            if only.admits(held_job.row.owner, held_job.row.name)
+            and (only.states is None or held_job.state in only.states)
         }
 
-    narrowed = wanted.name is not None or wanted.states is not None
-    found, following = listed.page(
-        _lists(wanted), cursor, limit, read, narrowed=narrowed, likely=likely if narrowed else None
+    narrowed = only.name is not None or only.states is not None
+    held_jobs, following = listed.page(
+        _lists(only), cursor, limit, read, narrowed=narrowed, likely=likely if narrowed else None
     )
-    jobs = [(with_links(held.job()), held.row.generation) for held in found]
+    jobs = [(with_links(held.job()), held.row.generation) for held in held_jobs]
     return JobPage(jobs=places.fill(jobs), cursor=following)
 
 
-def _lists(wanted: JobFilter) -> list[str]:
+def _lists(only: JobFilter) -> list[str]:
     """Return the shortest lists whose union holds all jobs that a filter admits.
 
     A job that has ended is among the unfinished ones until the server has noticed, so these are always looked at too.
     """
-    if wanted.capture is not None:
-        return [lists.on_capture(wanted.capture)]
-    if wanted.states is None:
-        return [lists.name("jobs", owner=wanted.owner)]
-    groups = [lists.UNFINISHED, *sorted(state.value for state in wanted.states if state.final)]
-    return [lists.name("jobs", owner=wanted.owner, group=group) for group in groups]
+    if only.capture is not None:
+        return [lists.on_capture(only.capture)]
+    if only.states is None:
+        return [lists.name("jobs", owner=only.owner)]
+    groups = [lists.UNFINISHED, *sorted(state.value for state in only.states if state.final)]
+    return [lists.name("jobs", owner=only.owner, group=group) for group in groups]
 
 
-def _likely(connection: redis.Redis, job_ids: Sequence[str], wanted: JobFilter) -> list[str]:
+def _likely(connection: redis.Redis, job_ids: Sequence[str], only: JobFilter) -> list[str]:
     """Return those of the jobs whose rows the filter admits, and which may be in one of its states.
 
     One script reads a few fields of each row, and of the states no more than whether they name a wanted one: many jobs
@@ -95,10 +95,10 @@ def _likely(connection: redis.Redis, job_ids: Sequence[str], wanted: JobFilter) 
     """
     if not job_ids:
         return []
-    states = sorted(state.value for state in wanted.states or ())
+    states = sorted(state.value for state in only.states or ())
     script = connection.register_script(_GLANCE)
     replies = cast(list[list[bytes | None]], script(args=[len(states), *states, *job_ids]))
     rows = [dict(zip(("likely", *JobFilter.FIELDS), reply, strict=True)) for reply in replies]
     return [
-        job_id for job_id, row in zip(job_ids, rows, strict=True) if row["likely"] and wanted.admits_row(row)
+        job_id for job_id, row in zip(job_ids, rows, strict=True) if row["likely"] and only.admits_row(row)
     ]

@@ -98,12 +98,12 @@ def _stored(storage: Storage, job_id: str) -> tuple[StoredEnd | None, list[str]]
 
 def _stored_lines(storage: Storage, job_id: str) -> list[LogLine]:
     """Return the lines in the file of a log, without those that are not readable."""
-    found, left_out = [], []
+    lines, left_out = [], []
     for line in _stored(storage, job_id)[1]:
         try:
-            found.append(LogLine.model_validate_json(line))
+            lines.append(LogLine.model_validate_json(line))
         except ValueError as error:
             left_out.append(reason(error))
     if left_out:
         warn(layout.job_log(job_id), f"left out what cannot be read: {'; '.join(left_out)[:300]}")
-    return found
+    return lines

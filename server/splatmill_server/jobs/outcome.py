@@ -40,12 +40,12 @@ def increments(row: JobRow, states: Sequence[StoredEvent]) -> dict[str, float]:
         return {}
     code = job.problem.code if job.state is JobState.failed and job.problem is not None else ""
     code = code if code in PROBLEMS or not code else "other"  # labels of metrics come from closed sets
-    found = totals.counted(totals.JOBS_ENDED, job.state.value, code)
+    counts = totals.counted(totals.JOBS_ENDED, job.state.value, code)
     whole = (job.finished_at - row.queued_at).total_seconds()
-    found |= totals.observed(totals.JOB_SECONDS, whole, job.state.value)
+    counts |= totals.observed(totals.JOB_SECONDS, whole, job.state.value)
     for stage, seconds in stage_seconds(row, states).items():
-        found |= totals.observed(totals.STAGE_SECONDS, seconds, stage)
-    return found
+        counts |= totals.observed(totals.STAGE_SECONDS, seconds, stage)
+    return counts
 
 
 def stage_seconds(row: JobRow, states: Sequence[StoredEvent]) -> dict[str, float]:

@@ -43,7 +43,7 @@ def read_jobs(connection: redis.Redis, job_ids: Sequence[str]) -> dict[str, Held
             pipe.xrange(keys.states(job_id))
             events.ask_progress(pipe, job_id)
         replies = iter(pipe.execute())
-    found = {}
+    jobs = {}
     for job_id, stored, states, progress in zip(job_ids, replies, replies, replies, strict=True):
         try:
             row = JobRow.of(stored)
@@ -52,5 +52,5 @@ def read_jobs(connection: redis.Redis, job_ids: Sequence[str]) -> dict[str, Held
             continue
         if row is not None:
             newest = events.answered_progress(progress, job_id)
-            found[job_id] = Held(row, events.decode(states, keys.states(job_id)), newest)
-    return found
+            jobs[job_id] = Held(row, events.decode(states, keys.states(job_id)), newest)
+    return jobs

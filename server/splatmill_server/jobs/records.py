@@ -132,9 +132,9 @@ class Jobs:
         An unfinished job that Redis has lost, as one that stops without its last second of writes does, is restored.
         """
         try:
-            found = row.read(self.connection, job_id) if layout.is_id(job_id) else None
-            if found is None and layout.is_id(job_id) and self.restore([job_id]):
-                found = row.read(self.connection, job_id)
+            job_row = row.read(self.connection, job_id) if layout.is_id(job_id) else None
+            if job_row is None and layout.is_id(job_id) and self.restore([job_id]):
+                job_row = row.read(self.connection, job_id)
         except UnreadableRecord as error:
             raise ProblemError(
                 "job_corrupt",
@@ -142,9 +142,9 @@ class Jobs:
                 advice="It was probably written by a later version of the server; run that version, or delete the "
                 "job.",
             ) from error
-        if found is None:
+        if job_row is None:
             raise job_not_found(job_id)
-        return found
+        return job_row
 
     def check_visible(self, who: Caller, job_id: str) -> None:
         """Raise a 404 problem if another owner has the job, but not if there is none."""
@@ -195,9 +195,9 @@ class Jobs:
         ended = job_log.get_stored_end(self.storage, job_id)
         return with_links(ended.job) if ended is not None else None
 
-    def list(self, cursor: str | None, limit: int, wanted: JobFilter | None = None) -> JobPage:
-        """Return a page of the jobs that `wanted` admits, newest first (see `Lists.page`)."""
-        return listing.page(self.connection, self.lists, self._places, cursor, limit, wanted or JobFilter())
+    def list(self, cursor: str | None, limit: int, only: JobFilter | None = None) -> JobPage:
+        """Return a page of the jobs that `only` admits, newest first (see `Lists.page`)."""
+        return listing.page(self.connection, self.lists, self._places, cursor, limit, only or JobFilter())
 
     def make_lists(self, succeeded: dict[str, Ended]) -> int:
         """List all jobs, restore those that storage alone knows, and return their number (see `Lists.makers`)."""
@@ -213,16 +213,16 @@ class Jobs:
         A job whose row is not readable stays active, but is left out.
         """
         ids = sorted(entry.decode() for entry in cast(set[bytes], self.connection.smembers(keys.ACTIVE)))
-        found = []
+        rows = []
         for start in range(0, len(ids), _TOGETHER):
             batch = ids[start : start + _TOGETHER]
             held = read_jobs(self.connection, batch)
             for job_id in batch:
                 if job_id in held and not held[job_id].state.final:
-                    found.append(held[job_id].row)
+                    rows.append(held[job_id].row)
                 elif job_id in held or not self.connection.exists(keys.job(job_id)):
                     self.retire(job_id)
-        return found
+        return rows
 
     def retire(self, job_id: str) -> None:
         """Store the log of a job that has ended, announce its end, and remove it from the set of active ones.
@@ -271,18 +271,18 @@ class Jobs:
             except StorageError as error:  # what is left shows nothing: the log in storage has the end
                 log.warning("the request of an ended job cannot be deleted", job=job_id, error=str(error))
 
-    def _announce_end(self, found: JobRow) -> None:
+    def _announce_end(self, job_row: JobRow) -> None:
         """Tell that a job has ended, if it has. Raises StorageError if that cannot be stored."""
-        job = self._job(found)
+        job = self._job(job_row)
         if not job.state.final:
             return
         for ended in self.on_end:
             try:
-                ended(job, found.generation)
+                ended(job, job_row.generation)
             except StorageError:
                 raise
             except Exception:  # other jobs must still be looked after
-                log.exception("the end of a job could not be announced", job=found.id)
+                log.exception("the end of a job could not be announced", job=job_row.id)
 
     def _announce_unretired(self, job_id: str) -> None:
         """Announce the end of a job that has ended so recently that it still counts as active."""
@@ -298,8 +298,8 @@ class Jobs:
     def cancel(self, job_id: str) -> Job:
         """Record the request to cancel a job. The reaper then kills its process and ends the job."""
 
-        def request_cancel(found: JobRow, job: Job) -> dict[str, str] | None:
-            if job.state is JobState.cancelled or found.cancel_requested_at is not None:
+        def request_cancel(job_row: JobRow, job: Job) -> dict[str, str] | None:
+            if job.state is JobState.cancelled or job_row.cancel_requested_at is not None:
                 return None
             if job.state.final:
                 raise ProblemError(
@@ -317,8 +317,8 @@ class Jobs:
 
         Raises 404 problems, and a 409 problem for a job that runs.
         """
-        found = self.get_row(job_id)
-        return self._placed(found) if _waits(found, self._job(found)) else None
+        job_row = self.get_row(job_id)
+        return self._placed(job_row) if _waits(job_row, self._job(job_row)) else None
 
     def restart(self, job_id: str, *, check: Callable[[], None], watched: Sequence[str]) -> Job:
         """Enqueue a job that has ended as a new generation, which resumes from its checkpoint if there is one.
@@ -326,14 +326,14 @@ class Jobs:
         check, watched: as for `create`.
         """
 
-        def begin_generation(found: JobRow, job: Job) -> dict[str, str] | None:
-            if _waits(found, job):
+        def begin_generation(job_row: JobRow, job: Job) -> dict[str, str] | None:
+            if _waits(job_row, job):
                 return None  # a repeated restart has no further effect
             check()
             moment = row.now()
-            requests.save(self.storage, requests.next_generation(found, moment, _request_id()))
+            requests.save(self.storage, requests.next_generation(job_row, moment, _request_id()))
             return {
-                "generation": str(found.generation + 1),
+                "generation": str(job_row.generation + 1),
                 "queued_at": moment.isoformat(),
                 "cancel_requested_at": "",
                 "verdict": "",
@@ -351,9 +351,9 @@ class Jobs:
     def delete(self, job_id: str) -> None:
         """Delete a job that has ended, its work files and its model. Raises 404 and 409 problems."""
         owner, capture = self.get_owner(job_id), None
-        found: JobRow | None = None
+        job_row: JobRow | None = None
         try:
-            found = self.get_row(job_id)
+            job_row = self.get_row(job_id)
         except ProblemError as error:
             if error.problem.code == "job_corrupt":
                 self._withdraw_unreadable(job_id)
@@ -362,8 +362,8 @@ class Jobs:
             else:
                 capture = ended.capture
         else:
-            capture = found.capture
-            job = self._job(found)
+            capture = job_row.capture
+            job = self._job(job_row)
             if not job.state.final:
                 raise ProblemError(
                     "job_running",
@@ -372,7 +372,7 @@ class Jobs:
                     facts={"state": job.state.value},
                 )
             self._announce_unretired(job_id)
-            for generation in range(1, found.generation + 1):
+            for generation in range(1, job_row.generation + 1):
                 queue.forget(self.connection, job_id, generation)
         states = events.read_states(self.connection, job_id)
         self.storage.delete(layout.unfinished_job(job_id))
@@ -385,8 +385,8 @@ class Jobs:
             lists.remove_job(pipe, job_id, owner, capture)
             lists.remove(pipe, "models", job_id, owner)
             pipe.hdel(keys.records("models"), job_id)
-            if found is not None:  # it may have ended so lately that it still counts as unfinished
-                outcome.retire(pipe, found, states)
+            if job_row is not None:  # it may have ended so lately that it still counts as unfinished
+                outcome.retire(pipe, job_row, states)
             pipe.srem(keys.ACTIVE, job_id)
             pipe.zrem(keys.UNSHRUNK, job_id)
             pipe.execute()
@@ -409,28 +409,28 @@ class Jobs:
 
         A process that is killed for a cancellation that `expected` does not know yet looks like a failure.
         """
-        given = False
+        decided = False
 
-        def verdict(found: JobRow, job: Job) -> dict[str, str] | None:
-            nonlocal given
+        def verdict(job_row: JobRow, job: Job) -> dict[str, str] | None:
+            nonlocal decided
             expects = expected.generation, expected.cancel_requested_at
-            given = not job.state.final and (found.generation, found.cancel_requested_at) == expects
-            if not given:
+            decided = not job.state.final and (job_row.generation, job_row.cancel_requested_at) == expects
+            if not decided:
                 return None
-            last = cast(list[Any], self.connection.xrevrange(keys.states(found.id), count=1))
+            last = cast(list[Any], self.connection.xrevrange(keys.states(job_row.id), count=1))
             after = last[0][0].decode() if last else events.START
             ending = Verdict(state=cast(Any, state), at=row.now(), after=after, problem=problem)
             return {"verdict": ending.model_dump_json(exclude_none=True)}
 
         self._change(expected.id, verdict)
-        return given
+        return decided
 
-    def _job(self, found: JobRow) -> Job:
-        states = events.read_states(self.connection, found.id)
-        return with_links(fold(found, states, events.last_progress(self.connection, found.id)))
+    def _job(self, job_row: JobRow) -> Job:
+        states = events.read_states(self.connection, job_row.id)
+        return with_links(fold(job_row, states, events.last_progress(self.connection, job_row.id)))
 
-    def _placed(self, found: JobRow) -> Job:
-        return self._places.fill([(self._job(found), found.generation)])[0]
+    def _placed(self, job_row: JobRow) -> Job:
+        return self._places.fill([(self._job(job_row), job_row.generation)])[0]
 
     def _change(
         self,
@@ -446,8 +446,8 @@ class Jobs:
         """
 
         def apply(pipe: Any) -> None:
-            found = self.get_row(job_id)
-            changes = decide(found, self._job(found))
+            job_row = self.get_row(job_id)
+            changes = decide(job_row, self._job(job_row))
             begins = changes is not None and "generation" in changes
             states = events.read_states(self.connection, job_id) if begins else []
             pipe.multi()
@@ -460,16 +460,21 @@ class Jobs:
             pipe.hset(keys.job(job_id), mapping=kept)
             if begins:
                 # The end of the former generation, if nobody has seen it yet.
-                outcome.retire(pipe, found, states)
+                outcome.retire(pipe, job_row, states)
                 pipe.sadd(keys.ACTIVE, job_id)
                 pipe.zrem(keys.UNSHRUNK, job_id)
-                created = lists.milliseconds(found.created_at)
-                lists.put_job(pipe, job_id, created, found.owner, found.capture, lists.UNFINISHED)
+                created = lists.milliseconds(job_row.created_at)
+                lists.put_job(pipe, job_id, created, job_row.owner, job_row.capture, lists.UNFINISHED)
             if deleted:
                 pipe.hdel(keys.job(job_id), *deleted)
 
-        seen = [keys.job(job_id), keys.states(job_id), *watched, *([begun] if begun is not None else [])]
-        self.connection.transaction(apply, *seen)
+        watched_keys = [
+            keys.job(job_id),
+            keys.states(job_id),
+            *watched,
+            *([begun] if begun is not None else []),
+        ]
+        self.connection.transaction(apply, *watched_keys)
         return self._placed(self.get_row(job_id))
 
     def _claim_key(self, owner: str, key: str, body: str, job_id: str) -> str:
@@ -488,9 +493,9 @@ class Jobs:
         return cast(str, known["job"])
 
 
-def _waits(found: JobRow, job: Job) -> bool:
+def _waits(job_row: JobRow, job: Job) -> bool:
     """Return whether a job waits, rather than having ended. Raises a 409 problem if it does neither."""
-    if job.state is JobState.queued and found.cancel_requested_at is None:
+    if job.state is JobState.queued and job_row.cancel_requested_at is None:
         return True
     if not job.state.final:
         raise ProblemError(

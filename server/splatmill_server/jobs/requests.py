@@ -21,10 +21,10 @@ def save(storage: Storage, begun: JobRow) -> None:
     storage.put(layout.unfinished_job(begun.id), begun.model_dump_json(exclude_none=True).encode())
 
 
-def next_generation(found: JobRow, moment: datetime, request: str | None) -> JobRow:
+def next_generation(job_row: JobRow, moment: datetime, request: str | None) -> JobRow:
     """Return the row of a job as its restart at this time, by this request, makes it."""
-    changes = {"generation": found.generation + 1, "queued_at": moment, "request": request}
-    return found.model_copy(update=changes | {"cancel_requested_at": None, "verdict": None})
+    changes = {"generation": job_row.generation + 1, "queued_at": moment, "request": request}
+    return job_row.model_copy(update=changes | {"cancel_requested_at": None, "verdict": None})
 
 
 def get(storage: Storage, job_id: str) -> JobRow | None:
@@ -42,16 +42,16 @@ def get(storage: Storage, job_id: str) -> JobRow | None:
 def list_ids(storage: Storage) -> list[str]:
     """Return the ids of all jobs whose rows are stored."""
     paths = (entry.path.rpartition("/")[2] for entry in storage.walk(layout.unfinished_jobs()))
-    found = (path.removesuffix(".json") for path in paths if path.endswith(".json"))
-    return sorted(job_id for job_id in found if layout.is_id(job_id))
+    ids = (path.removesuffix(".json") for path in paths if path.endswith(".json"))
+    return sorted(job_id for job_id in ids if layout.is_id(job_id))
 
 
 def delete(connection: redis.Redis, storage: Storage, ended: JobRow) -> None:
     """Delete the row of a job whose end is stored, unless it was restarted meanwhile."""
     storage.delete(layout.unfinished_job(ended.id))
     try:
-        found = row.read(connection, ended.id)
+        job_row = row.read(connection, ended.id)
     except UnreadableRecord:
         return
-    if found is not None and found.generation != ended.generation:
-        save(storage, found)
+    if job_row is not None and job_row.generation != ended.generation:
+        save(storage, job_row)

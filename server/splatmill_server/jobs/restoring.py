@@ -63,18 +63,20 @@ def restore_unfinished(connection: redis.Redis, storage: Storage, job_ids: Seque
     """
     missing = without_row(connection, job_ids)
     rows = [
-        found for found in each(lambda job_id: _unfinished(storage, job_id), missing) if found is not None
+        job_row
+        for job_row in each(lambda job_id: _unfinished(storage, job_id), missing)
+        if job_row is not None
     ]
     if not rows:
         return 0
     with connection.pipeline() as pipe:
-        for found in rows:
-            pipe.hset(keys.job(found.id), mapping=cast(Any, found.fields()))
-            pipe.hset(keys.latest(found.id), keys.SHRUNK, 1)
-            created = lists.milliseconds(found.created_at)
-            lists.put_job(pipe, found.id, created, found.owner, found.capture, lists.UNFINISHED)
-            pipe.sadd(keys.ACTIVE, found.id)
-            pipe.sadd(keys.RESTORED, found.id)
+        for job_row in rows:
+            pipe.hset(keys.job(job_row.id), mapping=cast(Any, job_row.fields()))
+            pipe.hset(keys.latest(job_row.id), keys.SHRUNK, 1)
+            created = lists.milliseconds(job_row.created_at)
+            lists.put_job(pipe, job_row.id, created, job_row.owner, job_row.capture, lists.UNFINISHED)
+            pipe.sadd(keys.ACTIVE, job_row.id)
+            pipe.sadd(keys.RESTORED, job_row.id)
         pipe.expire(keys.RESTORED, GRACE)
         pipe.execute()
     log.warning("jobs that Redis has lost were restored from storage", jobs=len(rows))
@@ -83,12 +85,12 @@ def restore_unfinished(connection: redis.Redis, storage: Storage, job_ids: Seque
 
 def _unfinished(storage: Storage, job_id: str) -> JobRow | None:
     """Return the row of an unfinished job, or None if its generation has ended and only the request was left."""
-    found = requests.get(storage, job_id)
-    ended = job_log.get_stored_end(storage, job_id) if found is not None else None
-    if found is not None and ended is not None and ended.generation >= found.generation:
+    request = requests.get(storage, job_id)
+    ended = job_log.get_stored_end(storage, job_id) if request is not None else None
+    if request is not None and ended is not None and ended.generation >= request.generation:
         storage.delete(layout.unfinished_job(job_id))
         return None
-    return found
+    return request
 
 
 def _list_rows(connection: redis.Redis, succeeded: dict[str, Ended]) -> int:
@@ -98,14 +100,14 @@ def _list_rows(connection: redis.Redis, succeeded: dict[str, Ended]) -> int:
     for batch in lists.members(connection, keys.JOBS, _BATCH):
         held = read_jobs(connection, batch)
         with connection.pipeline() as pipe:
-            for job_id, found in held.items():
-                unfinished = job_id in active or not found.state.final
-                group = lists.UNFINISHED if unfinished else found.state.value
-                created = lists.milliseconds(found.row.created_at)
-                lists.put_job(pipe, job_id, created, found.row.owner, found.row.capture, group)
+            for job_id, held_job in held.items():
+                unfinished = job_id in active or not held_job.state.final
+                group = lists.UNFINISHED if unfinished else held_job.state.value
+                created = lists.milliseconds(held_job.row.created_at)
+                lists.put_job(pipe, job_id, created, held_job.row.owner, held_job.row.capture, group)
                 if not unfinished:
                     shrinking.note(pipe, job_id, now)
-                    _note(succeeded, found.job())
+                    _note(succeeded, held_job.job())
             pipe.execute()
         count += len(held)
     return count

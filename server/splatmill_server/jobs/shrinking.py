@@ -44,20 +44,20 @@ def shrink(connection: redis.Redis, job_id: str) -> None:
     """Delete the streams of a job but its states, unless it was restarted meanwhile."""
 
     def apply(pipe: Any) -> None:
-        found: JobRow | None = None
+        job_row: JobRow | None = None
         try:
-            found = row.read(connection, job_id)
+            job_row = row.read(connection, job_id)
             stored = cast(Any, connection.xrange(keys.states(job_id)))
             states = events.decode(stored, keys.states(job_id))
-            ended = found is not None and fold(found, states).state.final
+            ended = job_row is not None and fold(job_row, states).state.final
         except UnreadableRecord:
             ended = False  # its streams stay until it is deleted
         pipe.multi()
         pipe.zrem(keys.UNSHRUNK, job_id)
-        if found is not None and ended:
+        if job_row is not None and ended:
             pipe.delete(*(stream(job_id) for stream in _SHRUNK))
             pipe.hset(keys.latest(job_id), keys.SHRUNK, 1)
-            kept = _needed(found, states)
+            kept = _needed(job_row, states)
             if len(kept) < len(states):
                 # Written anew under the same ids: Redis keeps the memory of single entries that are deleted.
                 pipe.delete(keys.states(job_id))
@@ -68,15 +68,15 @@ def shrink(connection: redis.Redis, job_id: str) -> None:
     connection.transaction(apply, keys.job(job_id), keys.states(job_id))
 
 
-def _needed(found: JobRow, states: Sequence[StoredEvent]) -> set[str]:
+def _needed(job_row: JobRow, states: Sequence[StoredEvent]) -> set[str]:
     """Return the ids of the states and plans that tell the job.
 
     A job that was interrupted a hundred times has those of a hundred attempts.
     """
-    last = max((stored.attempt for stored in states if stored.generation == found.generation), default=0)
+    last = max((stored.attempt for stored in states if stored.generation == job_row.generation), default=0)
     kept, begun, planned = [], False, None
     for stored in states:
-        if stored.generation != found.generation:
+        if stored.generation != job_row.generation:
             continue
         first = not begun and isinstance(stored.event, StateEvent)
         begun = begun or first
@@ -87,5 +87,5 @@ def _needed(found: JobRow, states: Sequence[StoredEvent]) -> set[str]:
     if planned is not None:
         kept.append(planned)
     kept.sort(key=lambda stored: stored.order)
-    same = fold(found, kept) == fold(found, states)
+    same = fold(job_row, kept) == fold(job_row, states)
     return {stored.id for stored in (kept if same else states)}

@@ -87,7 +87,7 @@ class _Events:
                 advice="Let the HTTP library set the Content-Type of the form.",
             )
         self._body = request.stream()
-        self._found: list[tuple[PartEvent, bytes]] = []
+        self._parts: list[tuple[PartEvent, bytes]] = []
         self._header, self._value, self._disposition = b"", b"", b""
         self.complete = False
         try:
@@ -111,7 +111,7 @@ class _Events:
 
     async def next(self) -> tuple[PartEvent, bytes] | None:
         """Return the next event, or None at the end of the body."""
-        while not self._found:
+        while not self._parts:
             chunk = await anext(self._body, None)
             if chunk is None:
                 return None
@@ -121,7 +121,7 @@ class _Events:
                 raise ProblemError(
                     "malformed_body", f"The multipart body is malformed: {error}.", advice="Send it again."
                 ) from error
-        return self._found.pop(0)
+        return self._parts.pop(0)
 
     def _on_part_begin(self) -> None:
         self._disposition = b""
@@ -138,13 +138,13 @@ class _Events:
         self._header, self._value = b"", b""
 
     def _on_headers_finished(self) -> None:
-        self._found.append(("headers", self._disposition))
+        self._parts.append(("headers", self._disposition))
 
     def _on_part_data(self, data: bytes, start: int, end: int) -> None:
-        self._found.append(("data", data[start:end]))
+        self._parts.append(("data", data[start:end]))
 
     def _on_part_end(self) -> None:
-        self._found.append(("end", b""))
+        self._parts.append(("end", b""))
 
     def _on_end(self) -> None:
         self.complete = True

@@ -14,11 +14,11 @@ from splatmill_server.access.caller import Caller, Who
 from splatmill_server.service import Shared
 
 
-async def _off_the_loop(check: Callable[[Caller, str], None], who: Caller, found: str) -> str:
+async def _off_the_loop(check: Callable[[Caller, str], None], who: Caller, record_id: str) -> str:
     """Check in a thread of the pool what an admin needs no check for, and return the id."""
     if not who.admin:
-        await run_in_threadpool(check, who, found)
-    return found
+        await run_in_threadpool(check, who, record_id)
+    return record_id
 
 
 async def _capture_id(

@@ -65,14 +65,14 @@ async def _response(
         headers["Content-Security-Policy"] = "sandbox allow-scripts"
     if matches(request.headers.get("if-none-match"), etag):
         return Response(status_code=304, headers=headers)
-    wanted = None
+    span = None
     if request.headers.get("if-range", etag) == etag:
-        wanted = _range(request.headers.get("range"), entry, headers)
-    start, end = wanted or (0, entry.size)
+        span = _range(request.headers.get("range"), entry, headers)
+    start, end = span or (0, entry.size)
     headers["Content-Length"] = str(end - start)
-    if wanted is not None:
+    if span is not None:
         headers["Content-Range"] = f"bytes {start}-{end - 1}/{entry.size}"
-    status = 200 if wanted is None else 206
+    status = 200 if span is None else 206
     if request.method == "HEAD" or start == end:
         return Response(status_code=status, headers=headers)
     whole = start == 0 and end == entry.size
@@ -94,10 +94,10 @@ def matches(header: str | None, etag: str) -> bool:
 def _range(header: str | None, entry: Entry, headers: dict[str, str]) -> tuple[int, int] | None:
     """Return the bytes [start, end) of a single range. Return None without a range, and for several ranges or a
     malformed one, which a server may ignore (RFC 9110)."""
-    found = _RANGE.fullmatch(header or "")
-    if found is None or not any(found.groups()):
+    match = _RANGE.fullmatch(header or "")
+    if match is None or not any(match.groups()):
         return None
-    first, last = (int(text) if text else None for text in found.groups())
+    first, last = (int(text) if text else None for text in match.groups())
     size = entry.size
     if first is None:
         start, end = max(size - (last or 0), 0), size

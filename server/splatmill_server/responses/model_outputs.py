@@ -47,7 +47,7 @@ async def rendered_by_query(service: Service, model_id: str, request: Request) -
     try:
         body = RenderRequest.from_query(request.query_params)
     except ValidationError as error:
-        located = [{**found, "loc": ("query", *found["loc"])} for found in error.errors()]
+        located = [{**fault, "loc": ("query", *fault["loc"])} for fault in error.errors()]
         raise RequestValidationError(located) from error
     path, seconds = rendering.render_path(model_id), service.settings.render_timeout
     visited = None

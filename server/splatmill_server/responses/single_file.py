@@ -86,17 +86,17 @@ def single_file(name: str, packed: bytes, cameras: ModelCameras, antialias: bool
 def _modules() -> Iterator[tuple[str, str]]:
     """The viewer's modules, each with its name and source. They import each other by these names, because relative
     addresses mean nothing between modules that have no address."""
-    wanted, seen = [PurePosixPath("viewer.js")], set()
-    while wanted:
-        path = wanted.pop()
-        if path in seen:
+    pending, visited = [PurePosixPath("viewer.js")], set()
+    while pending:
+        path = pending.pop()
+        if path in visited:
             continue
-        seen.add(path)
+        visited.add(path)
 
-        def named(found: re.Match[str], folder: PurePosixPath = path.parent) -> str:
-            other = _resolved(folder, found[2])
-            wanted.append(other)
-            return f'{found[1]}"splatmill/{other}"'
+        def named(match: re.Match[str], folder: PurePosixPath = path.parent) -> str:
+            other = _resolved(folder, match[2])
+            pending.append(other)
+            return f'{match[1]}"splatmill/{other}"'
 
         yield f"splatmill/{path}", _RELATIVE.sub(named, (WEB / "page" / path).read_text())
 

@@ -103,8 +103,8 @@ class Follower:
         known = zip(self.position.entries, ends, strict=True)
         self.position.entries = [min(pair, key=stream_order) for pair in known]
         if self.position.states != START:
-            seen = await cast(Any, self.redis.xrange(keys.states(self.job_id), max=self.position.states))
-            for stored in events.decode(seen, keys.states(self.job_id)):
+            states = await cast(Any, self.redis.xrange(keys.states(self.job_id), max=self.position.states))
+            for stored in events.decode(states, keys.states(self.job_id)):
                 self.fold.apply(stored)
         if self.position.row_events > 2 * row.generation:
             self.fold.close()
@@ -150,7 +150,7 @@ class Follower:
         self.fold.row = row
         if self.position.row_events < 2 * row.generation:
             yield self._row_event(2 * row.generation, row.queued_at, StateEvent(state=JobState.queued))
-        for stored, stream in batch.found:
+        for stored, stream in batch.events:
             if stored.order <= stream_order(self.position.entries[stream]):
                 continue  # read before it came by the feed
             self.position.entries[stream] = stored.id

@@ -69,16 +69,16 @@ async def _edit(
         {rendering.CLIENT_HEADER: client_of(request)},
         service.settings.orbit_timeout,
     )
-    found = await while_connected(request, asked)
-    if found is None:
+    answer = await while_connected(request, asked)
+    if answer is None:
         return Response(status_code=CLIENT_GONE)
     try:
-        if found.status_code != 200:
-            problem = await found.aread()
-            return Response(problem, found.status_code, media_type=found.headers.get("content-type"))
-        edited = Edited.model_validate_json(found.headers[EDIT_HEADER])
+        if answer.status_code != 200:
+            problem = await answer.aread()
+            return Response(problem, answer.status_code, media_type=answer.headers.get("content-type"))
+        edited = Edited.model_validate_json(answer.headers[EDIT_HEADER])
         if room is not None:
-            new_id = await store_edited(service.storage, model_id, body, edited, found.aiter_raw(), room)
+            new_id = await store_edited(service.storage, model_id, body, edited, answer.aiter_raw(), room)
             await run_in_threadpool(service.models.list_new, new_id)
             edited = edited.model_copy(update={"model": new_id})
     except httpx.TransportError as error:
@@ -88,6 +88,6 @@ async def _edit(
             advice="Nothing was stored. Try again in a few seconds.",
         ) from error
     finally:
-        await found.aclose()
+        await answer.aclose()
     headers = {} if room is None else {"Location": f"/v1/models/{edited.model}"}
     return JSONResponse(edited.model_dump(mode="json"), 200 if room is None else 201, headers)

@@ -78,13 +78,13 @@ async def _receive(
 
 def _log_renamed(service: Service, job_id: str, renamed: list[tuple[str, str]]) -> None:
     """Append a warning to the log of a new job for each file that is stored under another name."""
-    found = row.read(service.redis, job_id) if renamed else None
-    if found is None:
+    job_row = row.read(service.redis, job_id) if renamed else None
+    if job_row is None:
         return
     for name, stored in renamed:
         message = f"The file name {name[:80]!a} is not accepted; the file is stored as {stored}."
         warning = LogEvent(level="warning", message=message)
-        events.append(service.redis, job_id, found.generation, 0, warning)
+        events.append(service.redis, job_id, job_row.generation, 0, warning)
 
 
 async def _store(service: Service, who: Caller, capture_id: str, part: Part, filename: str) -> CaptureFile:

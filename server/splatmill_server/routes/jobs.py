@@ -116,7 +116,7 @@ async def _create_from_json(service: Service, who: Caller, body: bytes, key: str
 
 
 def _located(error: ValidationError) -> list[Any]:
-    return [{**found, "loc": ("body", *found["loc"])} for found in error.errors()]
+    return [{**fault, "loc": ("body", *fault["loc"])} for fault in error.errors()]
 
 
 @router.get("", responses=problems("cursor_invalid", "lists_not_ready"))

@@ -31,15 +31,15 @@ router = APIRouter(prefix="/v1/session", tags=["keys"])
 @needs(Scope.read)
 async def begin_session(service: Shared, who: Who, request: Request) -> Response:
     """Begin a session with the key in `Authorization`: until it ends, requests with its cookie are those of the key."""
-    given = bearer(request.headers)
-    if given is None or who.by_session or not who.with_key:
+    secret = bearer(request.headers)
+    if secret is None or who.by_session or not who.with_key:
         raise ProblemError(
             "session_needs_key",
             "A session is made from an API key in the header Authorization, and this request has none.",
             advice="Send the header 'Authorization: Bearer KEY'. A server without keys needs no session.",
         )
     check_origin(request.scope, request.headers, service.settings.own_names, required=False)
-    cookie = await service.sessions.create(Session(who.key_id, digest(given)))
+    cookie = await service.sessions.create(Session(who.key_id, digest(secret)))
     secure = request.url.scheme == "https" or request.headers.get("origin", "").startswith("https://")
     response = Response(status_code=204, headers={"Cache-Control": "no-store"})
     response.set_cookie(

@@ -73,10 +73,10 @@ def get_shared_formats(
     service: Shared, share: OpenShare, token: Annotated[str, Path(description="Token of the link.")]
 ) -> ModelDownloads:
     """List the file formats in which the model that a link shows can be downloaded."""
-    found = service.conversions.list(share.model)
+    downloads = service.conversions.list(share.model)
     base = address(f"/s/{token}/model/download")
-    formats = [form.model_copy(update={"address": f"{base}/{form.format}"}) for form in found.formats]
-    return found.model_copy(update={"formats": formats})
+    formats = [form.model_copy(update={"address": f"{base}/{form.format}"}) for form in downloads.formats]
+    return downloads.model_copy(update={"formats": formats})
 
 
 @router.head("/download/{format}", include_in_schema=False)

@@ -150,12 +150,12 @@ async def readyz(service: Shared) -> Response:
 @needs(Scope.metrics)
 async def get_metrics(service: Shared) -> Response:
     """Get the metrics in the text format of Prometheus. A key needs the scope `metrics` or `admin`."""
-    seen, state = await asyncio.gather(run_in_threadpool(_seen, service), _renderer_state(service))
-    found = [*scrape.families(seen), *scrape.of_disk(_spare(service)), *scrape.of_renderer(state)]
-    return Response(service.metrics.text(found), media_type=metrics.MEDIA_TYPE)
+    values, state = await asyncio.gather(run_in_threadpool(_redis_values, service), _renderer_state(service))
+    families = [*scrape.families(values), *scrape.of_disk(_spare(service)), *scrape.of_renderer(state)]
+    return Response(service.metrics.text(families), media_type=metrics.MEDIA_TYPE)
 
 
-def _seen(service: Service) -> scrape.Seen | None:
+def _redis_values(service: Service) -> scrape.RedisValues | None:
     """Return the values in Redis, or None if it does not answer."""
     try:
         return scrape.read(service.redis)
@@ -219,7 +219,7 @@ def _job_of(rq_id: str | None) -> str | None:
 def _redis_checks(service: Service) -> tuple[str, str, bool]:
     """Return what is to say of Redis and of its memory, and whether that is full."""
     try:
-        found = memory.read(service.redis)
+        memory_use = memory.read(service.redis)
     except redis.RedisError as error:
         log.warning(
             "Redis is not ready", error=str(error)
@@ -227,7 +227,7 @@ def _redis_checks(service: Service) -> tuple[str, str, bool]:
         refused = isinstance(error, redis.ResponseError | redis.AuthenticationError)
         said = "Redis refuses the request" if refused else "Redis cannot be reached"
         return f"{said}; {LOGGED}", "not known", False
-    return "ok", " ".join(found.trouble() or ["ok"]), found.full
+    return "ok", " ".join(memory_use.trouble() or ["ok"]), memory_use.full
 
 
 async def _renderer_check(service: Service) -> str:

@@ -33,18 +33,18 @@ def get_storage(
     usage = service.usage
     usage.refresh(OLDEST)
     owners = usage.ledger.owners() if owner is None else [owner]
-    uses = [usage.owner_use(found, _limit(service, who, found)) for found in owners]
+    uses = [usage.owner_use(account, _limit(service, who, account)) for account in owners]
     snapshot, ages = usage.snapshot(), service.sweeper.ages
     deletions = [
         PlannedDeletion(
-            kind=found.action,
-            id=found.held.id,
-            owner=found.held.owner,
-            bytes=found.bytes,
-            reason=found.reason,
+            kind=account.action,
+            id=account.held.id,
+            owner=account.held.owner,
+            bytes=account.bytes,
+            reason=account.reason,
         )
-        for found in plan(snapshot, ages, usage.ledger.clock())
-        if owner is None or found.held.owner == owner
+        for account in plan(snapshot, ages, usage.ledger.clock())
+        if owner is None or account.held.owner == owner
     ]
     return StorageUse(
         scanned_at=usage.scanned_at(),

@@ -69,25 +69,29 @@ async def begin(
     with _limits_on_413(service):
         owner = (await run_in_threadpool(service.captures.get_recent, capture_id)).owner
         async with service.quota.storing(who, owner, capture_id, RECORD_BYTES) as room:
-            found = await service.partial_uploads.create(capture_id, role, name, read_integer(length), digest)
-            room.stored = len(found.record.model_dump_json().encode()) if isinstance(found, Standing) else 0
-        if isinstance(found, CaptureFile):
-            return _stored(found, 200)
+            standing = await service.partial_uploads.create(
+                capture_id, role, name, read_integer(length), digest
+            )
+            room.stored = (
+                len(standing.record.model_dump_json().encode()) if isinstance(standing, Standing) else 0
+            )
+        if isinstance(standing, CaptureFile):
+            return _stored(standing, 200)
         try:
-            missing = max((found.record.length or 0) - found.offset, 0)
+            missing = max((standing.record.length or 0) - standing.offset, 0)
             await run_in_threadpool(service.quota.check_new, who, capture_id, missing)
         except ProblemError:
-            if not found.offset:
-                await service.partial_uploads.cancel(capture_id, found.record.id)
+            if not standing.offset:
+                await service.partial_uploads.cancel(capture_id, standing.record.id)
             raise
-        address = {"Location": f"/v1/captures/{capture_id}/uploads/{found.record.id}"}
+        address = {"Location": f"/v1/captures/{capture_id}/uploads/{standing.record.id}"}
         size = read_integer(request.headers.get("content-length"))
         if size or (size is None and "transfer-encoding" in request.headers):
             try:
                 async with service.quota.upload(who, capture_id, size, keeps_parts=True) as arrival:
-                    found, _, _ = await service.partial_uploads.append(
+                    standing, _, _ = await service.partial_uploads.append(
                         capture_id,
-                        found.record.id,
+                        standing.record.id,
                         arrival.counted(request.stream()),
                         offset=0,
                         complete=False,
@@ -96,7 +100,7 @@ async def begin(
             except ProblemError as error:
                 error.headers = {**(error.headers or {}), **address}
                 raise
-    return Response(status_code=201, headers=_state(service, found) | address)
+    return Response(status_code=201, headers=_state(service, standing) | address)
 
 
 @router.options("/{capture_id}/{role}/{name:path}", status_code=204, responses=problems("capture_not_found"))
@@ -119,8 +123,8 @@ def get_upload_limits(service: Shared, capture_id: CaptureId, role: Role, name: 
 )
 async def get_upload(service: Shared, capture_id: CaptureId, upload_id: UploadId) -> Response:
     """Get the number of bytes that the server holds. A request that still appends to the upload is ended."""
-    found = await service.partial_uploads.standing(capture_id, upload_id)
-    return Response(status_code=204, headers=_state(service, found) | {"Cache-Control": "no-store"})
+    standing = await service.partial_uploads.standing(capture_id, upload_id)
+    return Response(status_code=204, headers=_state(service, standing) | {"Cache-Control": "no-store"})
 
 
 @router.patch(
@@ -228,13 +232,13 @@ def _stored(file: CaptureFile, status: int) -> Response:
     return JSONResponse(file.model_dump(mode="json"), status, headers=headers)
 
 
-def _state(service: Service, found: Standing) -> dict[str, str]:
+def _state(service: Service, standing: Standing) -> dict[str, str]:
     headers = {
-        UPLOAD_OFFSET: str(found.offset),
-        UPLOAD_COMPLETE: write_boolean(found.record.stored is not None),
-        UPLOAD_LIMIT: _limits(service, found.seconds_left),
+        UPLOAD_OFFSET: str(standing.offset),
+        UPLOAD_COMPLETE: write_boolean(standing.record.stored is not None),
+        UPLOAD_LIMIT: _limits(service, standing.seconds_left),
     }
-    length = found.record.length
+    length = standing.record.length
     return headers | ({} if length is None else {UPLOAD_LENGTH: str(length)})
 
 

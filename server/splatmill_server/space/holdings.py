@@ -97,11 +97,11 @@ def folder(kind: StoredKind, record_id: str) -> str:
 
 def sums(entries: Iterable[Entry]) -> dict[tuple[StoredKind, str], Holding]:
     """Return the folders that hold these files, by kind and id, without owners."""
-    found: dict[tuple[StoredKind, str], _Sums] = {}
+    sums_by_record: dict[tuple[StoredKind, str], _Sums] = {}
     for entry in entries:
         if (place := layout.folder_of(entry.path)) is not None:
             kind = KINDS[place[0]]
-            found.setdefault((kind, place[1]), _Sums()).add(entry, kind, place[2])
+            sums_by_record.setdefault((kind, place[1]), _Sums()).add(entry, kind, place[2])
     return {
         (kind, record_id): Holding(
             kind=kind,
@@ -112,7 +112,7 @@ def sums(entries: Iterable[Entry]) -> dict[tuple[StoredKind, str], Holding]:
             modified=held.modified,
             whole=held.whole,
         )
-        for (kind, record_id), held in found.items()
+        for (kind, record_id), held in sums_by_record.items()
     }
 
 
@@ -126,15 +126,15 @@ def scan(
     changes, so that records are read once, and those of jobs that have rows never.
     job_owners: the owners of the jobs that have rows, for folders of jobs and of models that are not finished.
     """
-    found = sums(entries)
-    whole = [held for held in found.values() if held.whole]
+    totals = sums(entries)
+    whole = [held for held in totals.values() if held.whole]
     unknown = [held for held in whole if not _is_known(held, known)]
     records = each(lambda place: _record(storage, place), [_record_of(held) for held in unknown])
     told = {held.key: _with_facts(held, record) for held, record in zip(unknown, records, strict=True)}
     described = {
         (held.kind, held.id): told.get(held.key) or _as_before(held, known[held.key]) for held in whole
     }
-    for (kind, record_id), held in found.items():
+    for (kind, record_id), held in totals.items():
         if (kind, record_id) not in described:
             owner = job_owners.get(record_id) if kind is not StoredKind.capture else None
             model = described.get((StoredKind.model, record_id))

@@ -50,11 +50,11 @@ def all_jobs(connection: redis.Redis) -> dict[str, JobUse]:
     """Return what every job that has a row uses, by id."""
     ids = [entry.decode() for entry in cast(list[bytes], connection.zrange(keys.JOBS, 0, -1))]
     active = _active(connection)
-    found: dict[str, JobUse] = {}
-    wanted = sorted({*ids, *active})
-    for start in range(0, len(wanted), _BATCH):
-        found |= _read(connection, wanted[start : start + _BATCH], active)
-    return found
+    uses: dict[str, JobUse] = {}
+    all_ids = sorted({*ids, *active})
+    for start in range(0, len(all_ids), _BATCH):
+        uses |= _read(connection, all_ids[start : start + _BATCH], active)
+    return uses
 
 
 def unfinished_jobs(connection: redis.Redis) -> list[JobUse]:
@@ -68,15 +68,15 @@ def _active(connection: redis.Redis) -> set[str]:
 
 
 def _read(connection: redis.Redis, job_ids: Iterable[str], active: set[str]) -> dict[str, JobUse]:
-    wanted = list(job_ids)
+    ids = list(job_ids)
     with connection.pipeline(transaction=False) as pipe:
-        for job_id in wanted:
+        for job_id in ids:
             pipe.hmget(keys.job(job_id), *_FIELDS)
             pipe.xrevrange(keys.states(job_id), count=1)
         replies = pipe.execute()
-    held = read_jobs(connection, [job_id for job_id in wanted if job_id in active])
+    held = read_jobs(connection, [job_id for job_id in ids if job_id in active])
     uses = {}
-    for index, job_id in enumerate(wanted):
+    for index, job_id in enumerate(ids):
         fields = dict(zip(_FIELDS, replies[2 * index], strict=True))
         if fields["id"] is not None or fields["options"] is not None:
             ended = job_id in held and held[job_id].state.final
@@ -106,10 +106,10 @@ def _use(job_id: str, fields: Mapping[str, bytes | None], states: Any, unfinishe
 
 def _object(text: str | None) -> dict[str, Any] | None:
     try:
-        found = json.loads(text or "null")
+        value = json.loads(text or "null")
     except ValueError:
         return None
-    return found if isinstance(found, dict) else None
+    return value if isinstance(value, dict) else None
 
 
 def _seconds(text: Any) -> float:

@@ -80,8 +80,8 @@ class Ledger:
 
     def owners(self) -> list[str]:
         """Return the owners that have something in storage, sorted; NOBODY among them."""
-        found = cast(list[bytes], self.connection.hkeys(keys.STORED_TOTALS))
-        return sorted(owner.decode() for owner in found)
+        names = cast(list[bytes], self.connection.hkeys(keys.STORED_TOTALS))
+        return sorted(owner.decode() for owner in names)
 
     def account(self, owner: str) -> Account:
         """Return what an owner has in storage."""
@@ -89,7 +89,7 @@ class Ledger:
             pipe.hvals(keys.stored(owner))
             pipe.hgetall(keys.uploads(owner))
             stored, uploads = pipe.execute()
-        held = [found for value in stored if (found := _holding(value)) is not None]
+        held = [holding for value in stored if (holding := _holding(value)) is not None]
         return Account(held, _bytes_of(uploads, held))
 
     def bytes_of(self, owner: str) -> int:
@@ -123,13 +123,13 @@ class Ledger:
 
     def stored_since(self, listing: int) -> set[str]:
         """Return the captures, jobs and models that files were stored in since a listing began."""
-        found = set()
+        stored = set()
         for owner in self.owners():
             for field in cast(list[bytes], self.connection.hkeys(keys.uploads(owner))):
                 kind, record, number = [*field.decode().split("/"), ""][:3]
                 if kind == STORED and number.isdigit() and int(number) >= listing:
-                    found.add(record)
-        return found
+                    stored.add(record)
+        return stored
 
     def publish(
         self, began: float, listing: int, holdings: Iterable[Holding], jobs: Mapping[str, bool] | None = None
@@ -143,12 +143,17 @@ class Ledger:
         by_owner: dict[str, dict[str, Holding]] = {owner: {} for owner in self.owners()}
         for held in holdings:
             by_owner.setdefault(NOBODY if held.owner is None else held.owner, {})[held.key] = held
-        for owner, found in by_owner.items():
-            self._replace(owner, found, began, listing, jobs or {})
+        for owner, held_by_key in by_owner.items():
+            self._replace(owner, held_by_key, began, listing, jobs or {})
         self.connection.hset(keys.SCAN, mapping={"began": str(began), "ended": str(self.clock())})
 
     def _replace(
-        self, owner: str, found: Mapping[str, Holding], began: float, listing: int, jobs: Mapping[str, bool]
+        self,
+        owner: str,
+        holdings: Mapping[str, Holding],
+        began: float,
+        listing: int,
+        jobs: Mapping[str, bool],
     ) -> None:
         name, uploads_name = keys.stored(owner), keys.uploads(owner)
 
@@ -164,7 +169,7 @@ class Ledger:
                 for field, value in uploads.items()
                 if _is_over(field.decode(), value, began, listing, jobs)
             ]
-            kept = {key: held for key, held in found.items() if key not in marks}
+            kept = {key: held for key, held in holdings.items() if key not in marks}
             fields = {key: held.model_dump_json(exclude_defaults=True) for key, held in kept.items()} | marks
             pipe.multi()
             pipe.delete(name)
@@ -249,10 +254,10 @@ def _holding(value: bytes) -> Holding | None:
 
 def _deleted_at(value: bytes) -> float | None:
     try:
-        found = json.loads(value)
+        mark = json.loads(value)
     except ValueError:
         return None
-    moment = found.get("deleted_at") if isinstance(found, dict) else None
+    moment = mark.get("deleted_at") if isinstance(mark, dict) else None
     return float(moment) if isinstance(moment, int | float) else None
 
 
@@ -265,7 +270,7 @@ def _upload(value: bytes) -> Upload | None:
 
 def _bytes_of(uploads: Mapping[bytes, bytes], held: Iterable[Holding]) -> int:
     """The bytes of entries, as the scripts of `reservations` sum them."""
-    sizes = {found.key: found.size for found in held}
+    sizes = {holding.key: holding.size for holding in held}
     total = 0
     for field, value in uploads.items():
         kind, _, rest = field.decode().partition("/")

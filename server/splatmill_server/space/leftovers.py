@@ -72,8 +72,8 @@ def tidy_redis(connection: redis.Redis, seconds: float) -> dict[str, int]:
 def _pages(connection: redis.Redis, pattern: str) -> Iterator[list[str]]:
     cursor = 0
     while True:
-        cursor, found = cast(tuple[int, list[bytes]], connection.scan(cursor, match=pattern, count=_PAGE))
-        yield [name.decode("utf-8", "replace") for name in found]
+        cursor, names = cast(tuple[int, list[bytes]], connection.scan(cursor, match=pattern, count=_PAGE))
+        yield [name.decode("utf-8", "replace") for name in names]
         if not cursor:
             return
 

@@ -288,13 +288,13 @@ class Arrival:
             self.claim(self.received)
 
     def _grow(self) -> None:
-        wanted = max(self._claimed, self.received)
+        bytes_needed = max(self._claimed, self.received)
         if self.received > self._claimed:
-            wanted = -(-self.received // STEP) * STEP
+            bytes_needed = -(-self.received // STEP) * STEP
         try:
-            self.claim(wanted)
+            self.claim(bytes_needed)
         except ProblemError:
-            if wanted == self.received:
+            if bytes_needed == self.received:
                 raise
             self.claim(max(self.received, self._claimed))
 

@@ -50,16 +50,16 @@ class Planned:
 
 def plan(snapshot: Snapshot, ages: Ages, now: float) -> list[Planned]:
     """Return the deletions that are due, the oldest first."""
-    due = [found for found in _all(snapshot, ages) if now >= found.due]
-    return sorted(due, key=lambda found: (found.due, found.held.key))
+    due = [planned for planned in _all(snapshot, ages) if now >= planned.due]
+    return sorted(due, key=lambda planned: (planned.due, planned.held.key))
 
 
 def expiry(snapshot: Snapshot, ages: Ages) -> dict[str, float]:
     """Return when records are deleted for their age, in seconds since 1970, by key; the first of several ages."""
-    found: dict[str, float] = {}
+    expires: dict[str, float] = {}
     for entry in _all(snapshot, ages):
-        found[entry.held.key] = min(entry.due, found.get(entry.held.key, entry.due))
-    return found
+        expires[entry.held.key] = min(entry.due, expires.get(entry.held.key, entry.due))
+    return expires
 
 
 def _all(snapshot: Snapshot, ages: Ages) -> Iterator[Planned]:
@@ -69,9 +69,9 @@ def _all(snapshot: Snapshot, ages: Ages) -> Iterator[Planned]:
         if held.key in snapshot.needed:
             continue
         rule = {StoredKind.capture: _capture, StoredKind.model: _model, StoredKind.job: _job}[held.kind]
-        for found in rule(snapshot, ages, held):
-            if not (unclear and found.action in ("capture", "job")):
-                yield found
+        for planned in rule(snapshot, ages, held):
+            if not (unclear and planned.action in ("capture", "job")):
+                yield planned
     for use in snapshot.jobs.values():
         # A job that ended before it stored anything has a row alone.
         stored = Holding(kind=StoredKind.job, id=use.id, owner=use.owner, name=use.name)

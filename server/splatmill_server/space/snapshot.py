@@ -26,16 +26,16 @@ class Snapshot:
     @classmethod
     def of(cls, holdings: Iterable[Holding], jobs: Mapping[str, JobUse]) -> "Snapshot":
         """Return the snapshot of these records and jobs."""
-        held = {found.key: found for found in holdings}
+        held = {holding.key: holding for holding in holdings}
         needed: dict[str, str] = {}
-        last_used = {key: found.modified for key, found in held.items()}
+        last_used = {key: holding.modified for key, holding in held.items()}
         for use in jobs.values():
             for key in use.records:
                 last_used[key] = max(last_used.get(key, 0.0), use.last_heard)
                 if use.unfinished:
                     needed[key] = use.id
-        for found in held.values():
-            if found.kind is StoredKind.model and found.capture is not None:
-                key = Holding(kind=StoredKind.capture, id=found.capture).key
-                last_used[key] = max(last_used.get(key, 0.0), found.modified)
+        for holding in held.values():
+            if holding.kind is StoredKind.model and holding.capture is not None:
+                key = Holding(kind=StoredKind.capture, id=holding.capture).key
+                last_used[key] = max(last_used.get(key, 0.0), holding.modified)
         return cls(held, jobs, needed, last_used)

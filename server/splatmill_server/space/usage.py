@@ -77,16 +77,16 @@ class Usage:
         known |= {held.key: held for owner in self.ledger.owners() for held in self.account(owner).holdings}
         first = self.ledger.begin_listing()
         listed = _renewing(lock, self.storage.walk(""))
-        found = scan(self.storage, listed, known, {job.id: job.owner for job in jobs.values()})
+        holdings = scan(self.storage, listed, known, {job.id: job.owner for job in jobs.values()})
         second = self.ledger.begin_listing()
         # What was written to meanwhile is listed once more: the listing may have missed a part of it, or all.
         busy = self.ledger.stored_since(first)
         folders = [folder(kind, record_id) for record_id in sorted(busy) for kind in StoredKind]
         again = _renewing(lock, chain.from_iterable(map(self.storage.walk, folders)))
-        found = [held for held in found if held.id not in busy]
-        found += scan(self.storage, again, known, {job.id: job.owner for job in jobs.values()})
-        self.ledger.publish(began, second, found, {job.id: job.unfinished for job in jobs.values()})
-        log.debug("storage scanned", folders=len(found), bytes=sum(held.size for held in found))
+        holdings = [held for held in holdings if held.id not in busy]
+        holdings += scan(self.storage, again, known, {job.id: job.owner for job in jobs.values()})
+        self.ledger.publish(began, second, holdings, {job.id: job.unfinished for job in jobs.values()})
+        log.debug("storage scanned", folders=len(holdings), bytes=sum(held.size for held in holdings))
 
     def account(self, owner: str) -> Account:
         """Return what an owner has in storage."""
@@ -107,7 +107,7 @@ class Usage:
 
     def snapshot(self) -> Snapshot:
         """Return all records in storage as of the last scan, and how jobs use them now."""
-        held = [found for owner in self.ledger.owners() for found in self.account(owner).holdings]
+        held = [holding for owner in self.ledger.owners() for holding in self.account(owner).holdings]
         return Snapshot.of(held, all_jobs(self.connection))
 
     def scanned_at(self) -> datetime:
@@ -123,8 +123,8 @@ def largest(
 
     expires: when records reach their age, in seconds since 1970, by key.
     """
-    wanted = [held for held in snapshot.holdings.values() if owner is None or held.owner == owner]
-    wanted.sort(key=lambda held: (-held.size, held.key))
+    holdings = [held for held in snapshot.holdings.values() if owner is None or held.owner == owner]
+    holdings.sort(key=lambda held: (-held.size, held.key))
     return [
         StoredRecord(
             kind=held.kind,
@@ -137,7 +137,7 @@ def largest(
             needed_by=snapshot.needed.get(held.key),
             expires_at=moment(expires[held.key]) if held.key in expires else None,
         )
-        for held in wanted[:count]
+        for held in holdings[:count]
     ]
 
 

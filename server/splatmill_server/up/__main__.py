@@ -111,10 +111,10 @@ def _listen(host: str, port: int, data: Path) -> socket.socket:
             f"There is no port {port}. Choose one from 1 to 65535 with --port, or 0 for any free port."
         )
     try:
-        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        addresses = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
     except OSError as error:
         raise UpError(f"Cannot listen on {host}:{port}: {error}. Choose another --host or --port.") from error
-    family, kind, protocol, _, address = found[0]
+    family, kind, protocol, _, address = addresses[0]
     _check_exposure(str(address[0]).partition("%")[0], data)
     listener = socket.socket(family, kind, protocol)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -108,8 +108,8 @@ class DataFolder:
         digest = hashlib.sha256(os.fsencode(self.path)).hexdigest()[:12]
         folder = Path(tempfile.gettempdir()) / f"splatmill-{os.getuid()}-{digest}"
         folder.mkdir(mode=0o700, exist_ok=True)
-        seen = folder.lstat()
-        if folder.is_symlink() or seen.st_uid != os.getuid() or seen.st_mode & 0o077:
+        status = folder.lstat()
+        if folder.is_symlink() or status.st_uid != os.getuid() or status.st_mode & 0o077:
             raise UpError(
                 f"The folder {folder}, which is needed for private sockets, belongs to another "
                 f"user or is open to others; "

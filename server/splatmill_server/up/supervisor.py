@@ -154,7 +154,7 @@ class Supervisor:
             checks = json.loads(body)["checks"]
         except (ValueError, KeyError, TypeError):
             return f"the API does not answer. The end of its log:\n{self.folder.log_end('api')}"
-        wrong = "; ".join(f"{name}: {found}" for name, found in checks.items() if found != "ok")
+        wrong = "; ".join(f"{name}: {state}" for name, state in checks.items() if state != "ok")
         return f"{wrong}\nThe end of the log of the API:\n{self.folder.log_end('api')}"
 
     def _ask(self) -> tuple[int, bytes]:

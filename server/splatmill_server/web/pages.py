@@ -163,7 +163,7 @@ def _has_picture(model: SharedModel) -> bool:
 def _card(base: str, token: str, model: SharedModel) -> str:
     """Return the elements by which messengers show a picture of the model beside a link to it."""
     quality = f", {model.psnr:.1f} dB on photos not trained on" if model.psnr is not None else ""
-    found = {
+    card = {
         "og:type": "website",
         "og:title": model.name or "A scene in 3D",
         "og:description": f"{model.gaussians:,} Gaussians{quality}. Look at it from any side.",
@@ -172,8 +172,8 @@ def _card(base: str, token: str, model: SharedModel) -> str:
         "twitter:card": "summary_large_image",
     }
     if not _has_picture(model):
-        del found["og:image"]
-    return "".join(f'\n<meta property="{name}" content="{escape(text)}">' for name, text in found.items())
+        del card["og:image"]
+    return "".join(f'\n<meta property="{name}" content="{escape(text)}">' for name, text in card.items())
 
 
 def import_map(root: str) -> str:

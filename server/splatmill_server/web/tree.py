@@ -86,8 +86,8 @@ class Tree:
             return self._files[name]
 
     def _read(self) -> None:
-        found = sorted(path for path in self.folder.rglob("*") if path.is_file())
-        served = [path for path in found if path.suffix in MEDIA_TYPES and not path.name.startswith(".")]
+        files = sorted(path for path in self.folder.rglob("*") if path.is_file())
+        served = [path for path in files if path.suffix in MEDIA_TYPES and not path.name.startswith(".")]
         stats = [(path.relative_to(self.folder).as_posix(), path.stat()) for path in served]
         signature = tuple((name, stat.st_mtime_ns, stat.st_size) for name, stat in stats)
         if signature == self._signature:

@@ -178,7 +178,7 @@ def test_a_follower_that_is_too_slow_reads_again_what_it_has_missed(
         events.append(connection, job_id, 1, 1, ProgressEvent(stage="x", done=number))
 
     def told(batch: Batch) -> list[int]:
-        return [stored.event.done for stored, _ in batch.found if isinstance(stored.event, ProgressEvent)]
+        return [stored.event.done for stored, _ in batch.events if isinstance(stored.event, ProgressEvent)]
 
     async def slow() -> None:
         client = connect_async(redis_url)

@@ -172,21 +172,21 @@ export function ticks(low, high, count) {
   if (!(rough > 0)) return [low];
   const power = 10 ** Math.floor(Math.log10(rough));
   const step = power * ([1, 2, 5, 10].find((factor) => factor * power >= rough) ?? 10);
-  const found = [];
-  for (let index = Math.ceil(low / step); index * step <= high * (1 + 1e-12); index++) found.push(Number((index * step).toPrecision(10)));
-  return found;
+  const values = [];
+  for (let index = Math.ceil(low / step); index * step <= high * (1 + 1e-12); index++) values.push(Number((index * step).toPrecision(10)));
+  return values;
 }
 
 /** 1, 2 and 5 times powers of ten between two ends; at most eight. @param {number} low @param {number} high */
 export function decades(low, high) {
-  const found = [];
+  const values = [];
   for (let power = Math.floor(Math.log10(low)); power <= Math.ceil(Math.log10(high)); power++) {
     for (const factor of [1, 2, 5]) {
       const value = Number((factor * 10 ** power).toPrecision(3));
-      if (value >= low * 0.999 && value <= high * 1.001) found.push(value);
+      if (value >= low * 0.999 && value <= high * 1.001) values.push(value);
     }
   }
-  return found.length > 8 ? found.filter((value) => /^(0\.0*)?10*$/.test(plain(value))) : found;
+  return values.length > 8 ? values.filter((value) => /^(0\.0*)?10*$/.test(plain(value))) : values;
 }
 
 /** @param {unknown} value @returns {value is number} */

@@ -53,9 +53,9 @@ export function append(element, children) {
  * @returns {T}
  */
 export function byId(id) {
-  const found = document.getElementById(id);
-  if (!found) throw new Error(`The page has no element #${id}.`);
-  return /** @type {T} */ (found);
+  const element = document.getElementById(id);
+  if (!element) throw new Error(`The page has no element #${id}.`);
+  return /** @type {T} */ (element);
 }
 
 /** Return a button that is either pressed or not. @param {string} text @param {(on: boolean) => void} change */

@@ -158,17 +158,17 @@ export class View extends EventTarget {
 
   async begin() {
     const { options } = this;
-    const wanted = options.kind ?? "webgl";
+    const kind = options.kind ?? "webgl";
     /** The model that `open` was asked for. @type {Source} */
     this.source = options;
     /** @type {Promise<Source> | undefined} */
-    let found;
-    if (wanted === "webgl") {
+    let source;
+    if (kind === "webgl") {
       this.say("Loading the viewer");
       try {
         if (!hasWebGL()) throw new ViewerError("no_webgl", "This browser has no WebGL, which drawing in 3D needs.");
-        found = options.find?.((text) => this.say(text));
-        found?.catch(() => {}); // it is waited for below, unless the engine fails first
+        source = options.find?.((text) => this.say(text));
+        source?.catch(() => {}); // it is waited for below, unless the engine fails first
         this.surface = await Splats.open(this.canvas, {
           antialias: options.antialias,
           background: options.background === "white" ? [1, 1, 1] : [0, 0, 0],
@@ -182,7 +182,7 @@ export class View extends EventTarget {
     }
     if (!this.surface) {
       if (!options.model) throw new ViewerError("no_webgl", "Only a stored model can be shown without WebGL.");
-      this.kind = wanted === "depth" ? "depth" : "pictures";
+      this.kind = kind === "depth" ? "depth" : "pictures";
       this.surface = new Pictures(this.canvas, {
         model: options.model,
         depth: this.kind === "depth",
@@ -196,7 +196,7 @@ export class View extends EventTarget {
       });
     }
     this.element.dataset.kind = this.kind;
-    if (found && this.kind === "webgl") this.source = await found;
+    if (source && this.kind === "webgl") this.source = await source;
     this.say("");
     if (this.source.url || this.source.bytes || this.kind !== "webgl") await this.load(this.source);
     if (!options.camera && !options.cameras?.length && this.surface instanceof Splats) this.frameMiddle(this.surface.points);

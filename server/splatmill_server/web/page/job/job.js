@@ -292,9 +292,9 @@ function facts() {
   const set = Object.entries(job.options).filter(([, value]) => value !== null && value !== "auto");
   const said = ["preset", "time_budget", "steps", "max_gaussians", "image_size", "backend"];
   for (const name of said) {
-    const found = set.find(([key]) => key === name);
-    if (!found) continue;
-    const [, value] = found;
+    const setting = set.find(([key]) => key === name);
+    if (!setting) continue;
+    const [, value] = setting;
     rows.push([name.replaceAll("_", " "), name === "time_budget" ? seconds(value) : typeof value === "number" ? number(value) : String(value)]);
   }
   if (report?.peak_memory) rows.push(["Memory", `${bytes(report.peak_memory)} at most`]);
@@ -311,9 +311,9 @@ function showPhotos() {
 }
 
 function showWarnings() {
-  const found = [...new Set([...warningsOf(course.lines), ...(report?.warnings ?? [])])];
-  byId("warnings-card").hidden = !found.length;
-  byId("warnings").replaceChildren(...found.map((text) => h("li", {}, text)));
+  const sentences = [...new Set([...warningsOf(course.lines), ...(report?.warnings ?? [])])];
+  byId("warnings-card").hidden = !sentences.length;
+  byId("warnings").replaceChildren(...sentences.map((text) => h("li", {}, text)));
 }
 
 function showSeconds() {

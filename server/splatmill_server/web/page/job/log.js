@@ -11,9 +11,9 @@ const items = new WeakMap();
 export function showLog(list, lines) {
   const atEnd = list.scrollHeight - list.scrollTop - list.clientHeight < 30;
   for (const line of lines) if (!items.has(line)) items.set(line, itemOf(line));
-  const wanted = lines.map((line) => /** @type {HTMLLIElement} */ (items.get(line)));
-  while (list.firstChild && list.firstChild !== wanted[0]) list.firstChild.remove();
-  list.append(...wanted.slice(list.children.length));
+  const rows = lines.map((line) => /** @type {HTMLLIElement} */ (items.get(line)));
+  while (list.firstChild && list.firstChild !== rows[0]) list.firstChild.remove();
+  list.append(...rows.slice(list.children.length));
   if (atEnd) list.scrollTop = list.scrollHeight;
 }
 

@@ -23,10 +23,10 @@ export function planParts(plan) {
 
 /** @param {any} plan @param {string} name */
 function value(plan, name) {
-  const found = name === "sh_degree" ? plan.schedule?.degree : plan[name];
-  if (found === true) return "yes";
-  if (typeof found === "number") return Number.isInteger(found) ? number(found) : String(Number(found.toPrecision(4)));
-  return typeof found === "string" ? found : "";
+  const decided = name === "sh_degree" ? plan.schedule?.degree : plan[name];
+  if (decided === true) return "yes";
+  if (typeof decided === "number") return Number.isInteger(decided) ? number(decided) : String(Number(decided.toPrecision(4)));
+  return typeof decided === "string" ? decided : "";
 }
 
 /** @param {string} name */

@@ -41,20 +41,20 @@ function poster(job) {
 
 /** @param {any} job @returns {string[]} */
 function facts(job) {
-  const found = [];
+  const sentences = [];
   const { progress } = job;
-  if (job.state === "failed" && job.problem) found.push(job.problem.title);
+  if (job.state === "failed" && job.problem) sentences.push(job.problem.title);
   if (job.state === "queued") {
-    if (job.waiting_for) found.push(`waits for a worker of the queue ${job.waiting_for}`);
-    else if (job.queue_position !== null && job.queue_position !== undefined) found.push(job.queue_position === 0 ? "next in the queue" : `${job.queue_position} before it`);
+    if (job.waiting_for) sentences.push(`waits for a worker of the queue ${job.waiting_for}`);
+    else if (job.queue_position !== null && job.queue_position !== undefined) sentences.push(job.queue_position === 0 ? "next in the queue" : `${job.queue_position} before it`);
   }
   if (RUNNING.includes(job.state) && progress) {
-    if (progress.psnr) found.push(`${progress.psnr.toFixed(1)} dB`);
-    if (progress.eta) found.push(`about ${seconds(progress.eta)} left`);
+    if (progress.psnr) sentences.push(`${progress.psnr.toFixed(1)} dB`);
+    if (progress.eta) sentences.push(`about ${seconds(progress.eta)} left`);
   }
-  if (job.finished_at && job.started_at) found.push(`took ${seconds((Date.parse(job.finished_at) - Date.parse(job.started_at)) / 1000)}`);
-  found.push(ago(job.created_at));
-  return found;
+  if (job.finished_at && job.started_at) sentences.push(`took ${seconds((Date.parse(job.finished_at) - Date.parse(job.started_at)) / 1000)}`);
+  sentences.push(ago(job.created_at));
+  return sentences;
 }
 
 /** @param {any} job */

@@ -99,7 +99,7 @@ export class Edit {
       this.state.replaceChildren(h("p", { class: "error" }, problem));
       return;
     }
-    const wanted = {
+    const edit = {
       ...(this.crop.checked ? { box: this.box } : {}),
       ...(Number(this.opacity.value) > 0 ? { min_opacity: Number(this.opacity.value) } : {}),
       ...(Number(this.size.value) > 0 ? { max_size: Number(this.size.value) } : {}),
@@ -108,7 +108,7 @@ export class Edit {
     this.measureButton.disabled = this.makeButton.disabled = true;
     this.state.replaceChildren(h("p", { class: "hint" }, "The server renders the held-out photos before and after."));
     try {
-      const done = await send("POST", `${this.stage.shown.address}/edits`, wanted);
+      const done = await send("POST", `${this.stage.shown.address}/edits`, edit);
       this.state.replaceChildren(h("p", { class: "number" }, said(done)),
         done.model ? h("p", {}, h("a", { href: `/models/${encodeURIComponent(done.model)}` }, "Open the new model")) : "");
     } catch (error) {

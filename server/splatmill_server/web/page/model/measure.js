@@ -180,8 +180,8 @@ async function pointAt(address, view, x, y) {
 /** @param {string} key */
 function stored(key) {
   try {
-    const found = JSON.parse(localStorage.getItem(key) ?? "null");
-    return found && found.factor > 0 && typeof found.unit === "string" ? found : null;
+    const scale = JSON.parse(localStorage.getItem(key) ?? "null");
+    return scale && scale.factor > 0 && typeof scale.unit === "string" ? scale : null;
   } catch {
     return null;
   }

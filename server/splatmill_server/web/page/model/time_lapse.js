@@ -25,32 +25,32 @@ export function timeLapse({ report, address, model }, stage) {
   const state = h("output", { class: "number", for: "lapse" });
   const play = h("button", { type: "button", class: "small", onclick: () => void run() }, "Play");
   const note = h("p", { class: "hint", hidden: true }, "Snapshots are shown in the 3D view only.");
-  let wanted = last;
+  let chosen = last;
   let shown = last;
   let playing = false;
   /** @type {Promise<void> | null} */
   let busy = null;
 
   const tell = () => {
-    const at = taken[wanted];
+    const at = taken[chosen];
     state.textContent = at
       ? `after ${seconds(at.seconds)} of training, step ${number(at.step)}: ${number(at.gaussians)} Gaussians`
       : `the finished model: ${number(model.gaussians)} Gaussians`;
     slider.setAttribute("aria-valuetext", state.textContent);
   };
 
-  /** Show the wanted snapshot, and then the one that is wanted by then. */
+  /** Show the chosen snapshot, and then the one that is chosen by then. */
   async function follow() {
     try {
-      while (shown !== wanted) {
-        const next = wanted;
+      while (shown !== chosen) {
+        const next = chosen;
         const file = taken[next]?.file;
         await stage.view?.replace(file ? { url: `${address}/files/${file}` } : stage.view.source);
         shown = next;
       }
     } catch (error) {
       playing = false;
-      shown = wanted;
+      shown = chosen;
       notify(/** @type {Error} */ (error));
     } finally {
       busy = null;
@@ -59,7 +59,7 @@ export function timeLapse({ report, address, model }, stage) {
 
   /** @param {number} index */
   function go(index) {
-    wanted = index;
+    chosen = index;
     slider.value = String(index);
     tell();
     busy ??= follow();
@@ -69,7 +69,7 @@ export function timeLapse({ report, address, model }, stage) {
   async function run() {
     playing = !playing;
     play.textContent = playing ? "Stop" : "Play";
-    for (let index = wanted === last ? 0 : wanted + 1; playing && index <= last; index++) {
+    for (let index = chosen === last ? 0 : chosen + 1; playing && index <= last; index++) {
       await Promise.all([go(index), new Promise((done) => setTimeout(done, SHOWN_FOR))]);
     }
     playing = false;
@@ -89,9 +89,9 @@ export function timeLapse({ report, address, model }, stage) {
     available(yes) {
       slider.disabled = play.disabled = !yes;
       note.hidden = yes;
-      if (yes && wanted !== last) {
+      if (yes && chosen !== last) {
         shown = last; // a view that was opened anew shows the finished model
-        void go(wanted);
+        void go(chosen);
       }
     },
   };

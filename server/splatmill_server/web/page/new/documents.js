@@ -10,17 +10,17 @@
  */
 export async function documentsIn(given) {
   /** @type {Documents} */
-  const found = new Map();
+  const documents = new Map();
   for (const { path, file } of given) {
     if (!/(^|\/)transforms[^/]*\.json$/i.test(path)) continue;
     try {
       const document = JSON.parse(await file.text());
-      if (document !== null && typeof document === "object" && !Array.isArray(document)) found.set(path, document);
+      if (document !== null && typeof document === "object" && !Array.isArray(document)) documents.set(path, document);
     } catch {
       continue;
     }
   }
-  return found;
+  return documents;
 }
 
 /**

@@ -31,10 +31,10 @@ export class Gallery {
 
   /** Show the files as they are now. @param {import("./items.js").Items} items */
   show(items) {
-    const wanted = items.photos.filter((item) => !this.onlyBad || item.left || item.verdict.kind === "bad" || item.problem);
-    const shown = this.whole ? wanted : wanted.slice(0, SHOWN);
-    this.more.hidden = shown.length === wanted.length;
-    this.more.textContent = `Show all ${number(wanted.length)} photos`;
+    const photos = items.photos.filter((item) => !this.onlyBad || item.left || item.verdict.kind === "bad" || item.problem);
+    const shown = this.whole ? photos : photos.slice(0, SHOWN);
+    this.more.hidden = shown.length === photos.length;
+    this.more.textContent = `Show all ${number(photos.length)} photos`;
     this.fill(this.photos, shown, (item) => new PhotoTile(item, this.onToggle));
     this.fill(this.others, items.all.filter((item) => item.kind !== "photo" && item.kind !== "mask").slice(0, SHOWN), (item) => new FileRow(item, this.onToggle));
   }

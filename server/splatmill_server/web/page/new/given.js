@@ -17,9 +17,9 @@ export async function dropped(transfer) {
   });
   const plain = [...transfer.files];
   if (!entries.length) return plain.map((file) => ({ path: file.name, file }));
-  const found = [];
-  for (const entry of entries) found.push(...(await walk(entry)));
-  return stripped(found);
+  const files = [];
+  for (const entry of entries) files.push(...(await walk(entry)));
+  return stripped(files);
 }
 
 /** @param {FileList | null} files @returns {Given[]} */
@@ -27,10 +27,10 @@ export function chosen(files) {
   return stripped([...(files ?? [])].map((file) => ({ path: file.webkitRelativePath || file.name, file })));
 }
 
-/** @param {Given[]} found */
-function stripped(found) {
-  const paths = withoutTop(found.map(({ path }) => path));
-  return found.map(({ file }, index) => ({ path: paths[index], file }));
+/** @param {Given[]} files */
+function stripped(files) {
+  const paths = withoutTop(files.map(({ path }) => path));
+  return files.map(({ file }, index) => ({ path: paths[index], file }));
 }
 
 /** @param {FileSystemEntry} entry @returns {Promise<Given[]>} */
@@ -42,12 +42,12 @@ async function walk(entry) {
       return [{ path, file }];
     }
     const reader = /** @type {FileSystemDirectoryEntry} */ (entry).createReader();
-    const found = [];
+    const files = [];
     for (;;) {
       /** @type {FileSystemEntry[]} */
       const some = await new Promise((resolve, reject) => reader.readEntries(resolve, reject));
-      if (!some.length) return found; // a reader gives its entries in several parts
-      for (const inside of some) found.push(...(await walk(inside)));
+      if (!some.length) return files; // a reader gives its entries in several parts
+      for (const inside of some) files.push(...(await walk(inside)));
     }
   } catch (error) {
     throw new Error(`${path} cannot be read: ${error instanceof Error ? error.message : error}. Choose the files with the button in place of dropping them.`);

@@ -96,9 +96,9 @@ export class Items {
     const ending = suffix(path);
     const stem = path.slice(0, path.length - ending.length);
     for (let number = 1; ; number++) {
-      const wanted = number === 1 ? path : `${stem}-${number}${path.slice(stem.length)}`;
-      const known = this.byPath.get(wanted);
-      if (!known) return wanted;
+      const free = number === 1 ? path : `${stem}-${number}${path.slice(stem.length)}`;
+      const known = this.byPath.get(free);
+      if (!known) return free;
       if (known.file.size === file.size && known.file.lastModified === file.lastModified) return null;
     }
   }

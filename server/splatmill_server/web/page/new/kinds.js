@@ -73,14 +73,14 @@ export function suffix(path) {
 export function sort(paths, accepted, documents = new Map()) {
   const shown = [...paths].filter((path) => !isHidden(path)).sort(byCodePoint);
   const outputs = ownOutputs(shown, accepted);
-  const seen = shown.filter((path) => !outputs.has(path));
+  const visible = shown.filter((path) => !outputs.has(path));
   const isPhoto = (/** @type {string} */ path) => accepted.photos.includes(suffix(path));
   const isWhole = (/** @type {string} */ path) => [...accepted.videos, ...accepted.archives].includes(suffix(path));
-  const cameras = camerasIn(seen);
+  const cameras = camerasIn(visible);
   // Cameras in a folder without photos are those of the photos around it.
-  const top = seen.some((path) => path.startsWith(cameras.top) && isPhoto(path)) ? cameras.top : "";
+  const top = visible.some((path) => path.startsWith(cameras.top) && isPhoto(path)) ? cameras.top : "";
   const read = [...documents].filter(([path]) => cameras.transforms.includes(path)).map(([, document]) => document);
-  const pictures = seen.filter((path) => path.startsWith(top) && isPhoto(path));
+  const pictures = visible.filter((path) => path.startsWith(top) && isPhoto(path));
   let photoRoot = pictures.some((path) => path.startsWith(`${top}images/`)) ? `${top}images/` : top;
   const photos = named(read, "file_path", cameras.top);
   if (hasPhotosBeside(pictures.filter((path) => photos.has(path)), photoRoot)) photoRoot = top;
@@ -89,32 +89,32 @@ export function sort(paths, accepted, documents = new Map()) {
   for (const path of pictures) {
     if (drawn.has(path) && !masks.has(path)) masks.set(path, path.slice((path.startsWith(photoRoot) ? photoRoot : top).length));
   }
-  const poses = namesOf(cameras, seen);
+  const poses = namesOf(cameras, visible);
   const points = named(read, "ply_file_path", cameras.top);
-  for (const path of seen) if (points.has(path) && suffix(path) === ".ply") poses.set(path, path.slice(cameras.top.length));
+  for (const path of visible) if (points.has(path) && suffix(path) === ".ply") poses.set(path, path.slice(cameras.top.length));
   /** @type {Sorted} */
-  const found = { files: [], ignored: [], problem: cameras.problem, named: new Set([...drawn].filter((path) => masks.has(path))), others: new Map(), outputs: [], top: cameras.top };
+  const sorted = { files: [], ignored: [], problem: cameras.problem, named: new Set([...drawn].filter((path) => masks.has(path))), others: new Map(), outputs: [], top: cameras.top };
   if (!poses.size) {
-    const inside = seen.filter((path) => path.startsWith(photoRoot) && isPhoto(path));
-    found.problem ??= noPhotos(inside, accepted);
-    found.others = besidePhotos(inside, accepted);
+    const inside = visible.filter((path) => path.startsWith(photoRoot) && isPhoto(path));
+    sorted.problem ??= noPhotos(inside, accepted);
+    sorted.others = besidePhotos(inside, accepted);
   }
-  for (const path of seen) {
+  for (const path of visible) {
     const pose = poses.get(path);
     const mask = masks.get(path);
-    if (pose !== undefined) found.files.push({ role: "poses", name: pose, path });
-    else if (mask !== undefined) found.files.push({ role: "masks", name: mask, path });
-    else if (path.startsWith(photoRoot) && isPhoto(path) && !found.others.has(path)) {
-      found.files.push({ role: "images", name: path.slice(photoRoot.length), path });
-    } else found.ignored.push(path);
+    if (pose !== undefined) sorted.files.push({ role: "poses", name: pose, path });
+    else if (mask !== undefined) sorted.files.push({ role: "masks", name: mask, path });
+    else if (path.startsWith(photoRoot) && isPhoto(path) && !sorted.others.has(path)) {
+      sorted.files.push({ role: "images", name: path.slice(photoRoot.length), path });
+    } else sorted.ignored.push(path);
   }
-  if (!found.files.some((file) => file.role === "images")) {
-    found.files.push(...found.ignored.filter(isWhole).map((path) => /** @type {const} */ ({ role: "images", name: path, path })));
-    found.ignored = found.ignored.filter((path) => !isWhole(path));
+  if (!sorted.files.some((file) => file.role === "images")) {
+    sorted.files.push(...sorted.ignored.filter(isWhole).map((path) => /** @type {const} */ ({ role: "images", name: path, path })));
+    sorted.ignored = sorted.ignored.filter((path) => !isWhole(path));
   }
-  found.outputs.push(...outputs);
-  for (const file of found.files) file.name = file.name.normalize("NFC");
-  return found;
+  sorted.outputs.push(...outputs);
+  for (const file of sorted.files) file.name = file.name.normalize("NFC");
+  return sorted;
 }
 
 /**
@@ -257,8 +257,8 @@ function camerasIn(paths) {
 /** The data set that a folder with a COLMAP model belongs to, and the rank of its place there. @param {string} folder */
 function placeOf(folder) {
   for (const [rank, place] of MODEL_PLACES) {
-    const found = place.exec(folder);
-    if (found) return { top: folder.slice(0, found.index), rank };
+    const match = place.exec(folder);
+    if (match) return { top: folder.slice(0, match.index), rank };
   }
   return { top: folder, rank: MODEL_PLACES.length };
 }
@@ -271,7 +271,7 @@ function numberOf(folder) {
 /** The name in the capture of each path that is a pose file. @param {Cameras} cameras @param {string[]} paths */
 function namesOf(cameras, paths) {
   /** @type {Map<string, string>} */
-  const found = new Map(cameras.transforms.map((path) => [path, path.slice(cameras.top.length)]));
+  const poses = new Map(cameras.transforms.map((path) => [path, path.slice(cameras.top.length)]));
   /** @type {string[]} */
   const places = [];
   for (const folder of cameras.models) {
@@ -282,10 +282,10 @@ function namesOf(cameras, paths) {
       const base = path.slice(folder.length);
       const ending = suffix(path);
       const stem = base.slice(0, base.length - ending.length).toLowerCase();
-      if (MODEL_STEMS.includes(stem) && MODEL_SUFFIXES.includes(ending)) found.set(path, `sparse/${number}/${base}`);
+      if (MODEL_STEMS.includes(stem) && MODEL_SUFFIXES.includes(ending)) poses.set(path, `sparse/${number}/${base}`);
     }
   }
-  return found;
+  return poses;
 }
 
 /** The order of Python's strings. @param {string} one @param {string} other */

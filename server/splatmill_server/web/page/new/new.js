@@ -210,13 +210,13 @@ async function estimate() {
   if (question === asked) return;
   asked = question;
   try {
-    const found = await send("POST", "/v1/estimate", body);
+    const estimate = await send("POST", "/v1/estimate", body);
     if (asked !== question) return;
     form.show(null);
     showProblem(null);
     byId("estimate").replaceChildren(items.lacking ? h("p", { class: "error" }, items.lacking) : photos === null
       ? h("p", {}, "How long it will take is not known: the server has yet to count the photos in the archive.")
-      : estimateOf(found, photos, info.queued));
+      : estimateOf(estimate, photos, info.queued));
   } catch (error) {
     if (!(error instanceof Problem) || asked !== question) return;
     asked = "";

@@ -51,9 +51,9 @@ export class OptionsForm {
   /** What was typed, without the fields that were left alone. @returns {Record<string, string>} */
   typed() {
     /** @type {Record<string, string>} */
-    const found = {};
-    for (const [name, { control }] of this.fields) if (control() !== "") found[name] = control();
-    return found;
+    const texts = {};
+    for (const [name, { control }] of this.fields) if (control() !== "") texts[name] = control();
+    return texts;
   }
 
   /** Put in what was typed before. @param {Record<string, string>} typed */
@@ -79,16 +79,16 @@ export class OptionsForm {
   /** The options of a request. What is not a number is sent as it is, so that the server says what is wrong with it. */
   values() {
     /** @type {Record<string, any>} */
-    const found = {};
+    const values = {};
     const typed = this.typed();
     for (const { name, type } of this.options) {
       const text = typed[name]?.trim();
       if (!text) continue;
-      if (type === "flag") found[name] = text === "true";
-      else if (type === "list") found[name] = text.split("\n").map((line) => line.trim()).filter(Boolean);
-      else found[name] = ["integer", "number"].includes(type) && NUMBER.test(text) ? Number(text) : text;
+      if (type === "flag") values[name] = text === "true";
+      else if (type === "list") values[name] = text.split("\n").map((line) => line.trim()).filter(Boolean);
+      else values[name] = ["integer", "number"].includes(type) && NUMBER.test(text) ? Number(text) : text;
     }
-    return found;
+    return values;
   }
 
   /**
@@ -158,15 +158,15 @@ export class OptionsForm {
 
   /** @param {Option} option @param {Record<string, string>} attributes */
   control(option, attributes) {
-    const given = { ...attributes, name: option.name, onchange: this.onChange, oninput: this.onChange, autocomplete: "off", spellcheck: "false" };
+    const common = { ...attributes, name: option.name, onchange: this.onChange, oninput: this.onChange, autocomplete: "off", spellcheck: "false" };
     if (option.type === "choice") {
-      return h("select", given, (option.choices ?? []).map((choice) => h("option", { value: choice === option.default ? "" : choice }, choice)));
+      return h("select", common, (option.choices ?? []).map((choice) => h("option", { value: choice === option.default ? "" : choice }, choice)));
     }
-    if (option.type === "flag") return h("input", { ...given, type: "checkbox" });
-    if (option.type === "list") return h("textarea", { ...given, rows: 2, placeholder: EXAMPLES.list });
+    if (option.type === "flag") return h("input", { ...common, type: "checkbox" });
+    if (option.type === "list") return h("textarea", { ...common, rows: 2, placeholder: EXAMPLES.list });
     const example = option.type === "duration" || option.type === "bytes" ? EXAMPLES[option.type] : "not set";
     const inputmode = option.type === "integer" ? "numeric" : option.type === "number" ? "decimal" : "text";
-    return h("input", { ...given, type: "text", inputmode, placeholder: option.default === null ? example : String(option.default) });
+    return h("input", { ...common, type: "text", inputmode, placeholder: option.default === null ? example : String(option.default) });
   }
 
   /** @param {Option} option @param {string} label @param {HTMLElement} error @param {HTMLElement} help */

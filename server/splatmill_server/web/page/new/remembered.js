@@ -20,8 +20,8 @@ const KEY = `splatmill.upload${at("/").slice(1)}`;
 /** @returns {Upload | null} */
 export function recall() {
   try {
-    const found = JSON.parse(localStorage.getItem(KEY) ?? "null");
-    return found && Array.isArray(found.files) && typeof found.key === "string" ? found : null;
+    const upload = JSON.parse(localStorage.getItem(KEY) ?? "null");
+    return upload && Array.isArray(upload.files) && typeof upload.key === "string" ? upload : null;
   } catch {
     return null; // storage is off in this browser, or another version wrote it
   }

@@ -113,8 +113,8 @@ function aboveUsual(values) {
  * @param {(one: T) => boolean} has
  */
 function exceptions(read, has) {
-  const found = new Set(read.filter(has).map(({ photo }) => photo));
-  return (/** @type {Seen} */ photo) => found.has(photo) && 2 * found.size <= Math.max(read.length, 2);
+  const photos = new Set(read.filter(has).map(({ photo }) => photo));
+  return (/** @type {Seen} */ photo) => photos.has(photo) && 2 * photos.size <= Math.max(read.length, 2);
 }
 
 /**

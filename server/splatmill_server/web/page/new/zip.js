@@ -32,19 +32,19 @@ export async function namesIn(zip) {
 
 /** @param {DataView} list @returns {string[] | null} */
 function names(list) {
-  const found = [];
+  const encoded = [];
   const unmarked = new Set();
   for (let at = 0; at + 46 <= list.byteLength; ) {
     if (list.getUint32(at, true) !== ENTRY) return null;
     const length = list.getUint16(at + 28, true);
     if (at + 46 + length > list.byteLength) return null;
-    found.push(new Uint8Array(list.buffer, list.byteOffset + at + 46, length));
-    if (!(list.getUint16(at + 8, true) & UTF8)) unmarked.add(found[found.length - 1]);
+    encoded.push(new Uint8Array(list.buffer, list.byteOffset + at + 46, length));
+    if (!(list.getUint16(at + 8, true) & UTF8)) unmarked.add(encoded[encoded.length - 1]);
     at += 46 + length + list.getUint16(at + 30, true) + list.getUint16(at + 32, true);
   }
   const text = new TextDecoder(ENCODINGS.find((encoding) => decodes([...unmarked], encoding)));
   const marked = new TextDecoder();
-  return found
+  return encoded
     .map((name) => (unmarked.has(name) ? text : marked).decode(name).replaceAll("\\", "/"))
     .filter((name) => !name.endsWith("/"));
 }

@@ -23,10 +23,10 @@ form.addEventListener("submit", async (event) => {
   error.textContent = "";
   key.removeAttribute("aria-invalid");
   // A header holds ASCII only; a key that was copied with something else cannot be right.
-  const given = key.value.trim();
+  const secret = key.value.trim();
   try {
-    if (!/^[\x21-\x7e]+$/.test(given)) throw new Error("A key consists of letters, digits and a few signs, without spaces.");
-    await request("POST", "/v1/session", { headers: { Authorization: `Bearer ${given}` }, stay: true });
+    if (!/^[\x21-\x7e]+$/.test(secret)) throw new Error("A key consists of letters, digits and a few signs, without spaces.");
+    await request("POST", "/v1/session", { headers: { Authorization: `Bearer ${secret}` }, stay: true });
     location.replace(next());
   } catch (refused) {
     const wrong = refused instanceof Problem && refused.status === 401;

@@ -55,13 +55,13 @@ export class Overlay {
     const plain = style.getPropertyValue("--frustum") || "#4da3ff";
     const accent = style.getPropertyValue("--mark") || "#ffb000";
     /** @param {Vec} point */
-    const seen = (point) => projected(pose, point, focal, width, height);
+    const project = (point) => projected(pose, point, focal, width, height);
     const near = 0.02 * this.size;
     /** @param {Vec} a @param {Vec} b */
     const segment = (a, b) => {
       const clipped = inFront(pose, a, b, near);
       if (!clipped) return;
-      const [from, to] = clipped.map(seen);
+      const [from, to] = clipped.map(project);
       context.moveTo(from.x, from.y);
       context.lineTo(to.x, to.y);
     };
@@ -86,7 +86,7 @@ export class Overlay {
         segment(corners[i], corners[(i + 1) % 4]);
       }
       stroke(camera.selected ? accent : (camera.color ?? plain), camera.selected ? 2.5 : 1.25);
-      const tip = seen(corners[4]);
+      const tip = project(corners[4]);
       if (tip.depth > near) this.tips.push({ camera, x: tip.x, y: tip.y });
     }
     if (this.box) {
@@ -102,10 +102,10 @@ export class Overlay {
       context.beginPath();
       for (let i = 1; i < line.points.length; i++) segment(line.points[i - 1], line.points[i]);
       stroke(line.color ?? accent, 2);
-      if (line.label) label(context, line.label, seen(times(add(line.points[0], line.points[line.points.length - 1]), 0.5)));
+      if (line.label) label(context, line.label, project(times(add(line.points[0], line.points[line.points.length - 1]), 0.5)));
     }
     for (const point of this.points) {
-      const at = seen(point);
+      const at = project(point);
       if (at.depth <= near) continue;
       context.beginPath();
       context.arc(at.x, at.y, 5, 0, 2 * Math.PI);
@@ -118,13 +118,13 @@ export class Overlay {
    * @param {number} x @param {number} y  CSS pixels
    */
   cameraAt(x, y) {
-    let found = null;
+    let nearest = null;
     let least = REACH;
     for (const tip of this.tips) {
       const away = Math.hypot(tip.x - x, tip.y - y);
-      if (away < least) [found, least] = [tip.camera, away];
+      if (away < least) [nearest, least] = [tip.camera, away];
     }
-    return found;
+    return nearest;
   }
 }
 

@@ -26,14 +26,14 @@ export async function opened(source) {
   const answer = source.bytes ? new Response(/** @type {BodyInit} */ (source.bytes)) : await fetched(source.url);
   if (!answer.body) throw empty();
   const [start, whole] = answer.body.tee();
-  const seen = await beginning(start);
-  const format = known(READ, seen);
+  const first = await beginning(start);
+  const format = known(READ, first);
   if (format) return { format, contents: new Response(whole, { headers: answer.headers }) };
   void whole.cancel();
-  if (!seen) throw empty();
-  const other = known(OTHER, seen);
+  if (!first) throw empty();
+  const other = known(OTHER, first);
   if (other) throw new ViewerError("format", `${DRAWN} This is a file of the format ${other}.`);
-  const codes = [...seen].map((letter) => letter.charCodeAt(0).toString(16).padStart(2, "0")).join(" ");
+  const codes = [...first].map((letter) => letter.charCodeAt(0).toString(16).padStart(2, "0")).join(" ");
   throw new ViewerError("format", `${DRAWN} This file is none of them: it begins with the bytes ${codes}.`);
 }
 
@@ -52,18 +52,18 @@ function empty() {
  */
 async function beginning(stream) {
   const reader = stream.getReader();
-  let seen = "";
+  let text = "";
   try {
-    while (seen.length < 4) {
+    while (text.length < 4) {
       const { value, done } = await reader.read();
       if (done) break;
-      seen += String.fromCharCode(...value.subarray(0, 4 - seen.length));
+      text += String.fromCharCode(...value.subarray(0, 4 - text.length));
     }
   } catch (error) {
     throw new ViewerError("unreadable", "The connection ended while the model was loaded.", { cause: error });
   }
   void reader.cancel();
-  return seen;
+  return text;
 }
 
 /** @param {string | undefined} url */
