@@ -107,7 +107,7 @@ POSES = (
     ),
     _transforms("`test_filenames` that is a number", _document(test_filenames=7), said="test_filenames"),
     _transforms("100,000 brackets", b"[" * 100_000, said="not readable JSON"),
-    _transforms("bytes that are not UTF-8", b'{"frames": "\xff"}', said="not readable JSON"),
+    _transforms("bytes that are not UTF-8", b'{"frames": "\xff"}', said="no list `frames`"),
     _transforms("a list for an object", b"[]", said="frames"),
     _transforms("65 MB", b" " * 65 * 2**20, said="at most"),
     _transforms("a principal point at 1e300", models.transforms(cx=1e300), said="Frame 0"),

@@ -1,18 +1,20 @@
-"""Proves that names of a COLMAP model in the encoding of a system are matched to the photos, as text and as binary, and
-that two readings which lead to different photos are refused with both named.
+"""Proves that names in files of cameras in the encoding of a system are matched to the photos, in COLMAP models and in
+transforms.json, and that two readings which lead to different photos are refused with both named.
 
 Not proven here: names in a zip (images/test_archive.py).
 """
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
 
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.readers import colmap_files
-from tests.support.posed_sets import check, loaded, model, photos
+from splatmill_worker.sfm.posed.encodings import NamesUnclear
+from tests.support.posed_sets import check, frames, loaded, model, photos
 
 SYSTEMS = {
     "cp932": "写真",
@@ -60,6 +62,45 @@ def test_a_binary_model_is_read_so_too(tmp_path: Path) -> None:
     path = tmp_path / "sparse/0/images.bin"
     path.write_bytes(path.read_bytes().replace(b"photo_", "写真 ".encode("cp932")))
     check(loaded(tmp_path), {name: k for k, name in enumerate(names)})
+
+
+@pytest.mark.parametrize(("encoding", "word"), [*SYSTEMS.items(), ("cp932", "表ソ能")])
+def test_transforms_in_the_encoding_of_a_system_name_the_photos(
+    tmp_path: Path, encoding: str, word: str
+) -> None:
+    names = [f"{word} {k}.jpg" for k in range(4)]
+    photos(tmp_path / "images", names)
+    document = {"w": 64, "h": 48, "fl_x": 60, "fl_y": 61, "cx": 32, "cy": 24, "frames": frames(names)}
+    text = json.dumps(document, ensure_ascii=False)
+    (tmp_path / "transforms.json").write_bytes(text.encode(encoding))
+    scene = loaded(tmp_path)
+    check(scene, {name: k for k, name in enumerate(names)})
+    assert scene.left_out == ()
+    (warning,) = scene.warnings
+    assert f" {encoding} (" in warning
+    assert f"{word} 0.jpg" in warning
+
+
+def test_two_readings_of_transforms_that_lead_to_different_photos_are_refused(tmp_path: Path) -> None:
+    raw = "Снимок".encode("cp1251")
+    both = [raw.decode("cp1251"), raw.decode("cp866")]
+    photos(tmp_path / "images", [f"{word} {k}.jpg" for word in both for k in range(2)])
+    text = json.dumps(
+        {"camera_angle_x": 1.0, "frames": frames([f"Снимок {k}.jpg" for k in range(2)])}, ensure_ascii=False
+    )
+    (tmp_path / "transforms.json").write_bytes(text.encode("cp1251"))
+    with pytest.raises(NamesUnclear) as refused:
+        loaded(tmp_path)
+    assert all(word in str(refused.value) for word in both)
+
+
+def test_a_remark_in_another_encoding_leaves_names_in_ascii_as_they_are(tmp_path: Path) -> None:
+    photos(tmp_path / "images", names := [f"{k}.jpg" for k in range(3)])
+    text = json.dumps({"camera_angle_x": 1.0, "by": "Jürgen", "frames": frames(names)}, ensure_ascii=False)
+    (tmp_path / "transforms.json").write_bytes(text.encode("cp1252"))
+    scene = loaded(tmp_path)
+    check(scene, {name: k for k, name in enumerate(names)})
+    assert scene.warnings == ()
 
 
 def test_photos_in_folders_and_other_cases_are_found(tmp_path: Path) -> None:

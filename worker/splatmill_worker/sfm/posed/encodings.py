@@ -1,11 +1,14 @@
-"""Reads the names of a COLMAP model that are not UTF-8: in the encoding in which they are those of the photos.
+"""Reads names in files of cameras that are not UTF-8: in the encoding in which they are those of the photos.
 
-COLMAP writes the bytes of the system, which on Windows are those of its code page.
+COLMAP writes the bytes of the system, which on Windows are those of its code page, as many scripts do.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
+from typing import TypeVar
 
 from splatmill_worker.images.archives.zip_names import ENCODINGS, label
 from splatmill_worker.sfm.posed.files import ImageFiles
@@ -15,44 +18,60 @@ from splatmill_worker.sfm.posed.model_files import GivenModel
 def decoded(model: GivenModel, files: ImageFiles) -> tuple[GivenModel, tuple[str, ...]]:
     """The model with names of text alone, and sentences on how they were read, if they are not UTF-8.
 
-    Of the encodings of zips, that is taken in which the most names are those of photos. Raises ValueError where two of
-    them lead to different photos.
+    Raises NamesUnclear.
     """
     names = {image.name for image in model.images.values()} | {name for name, _ in model.faulty}
-    unclear = {name: raw for name in names if (raw := _bytes(name)) is not None}
+    unclear = {name: raw for name in sorted(names) if (raw := _bytes(name)) is not None}
     if not unclear:
         return model, ()
-    photos: dict[str, dict[str, str]] = {}
+    readings: dict[str, dict[str, str]] = {}
     for encoding in ENCODINGS:
-        try:
-            read = {name: raw.decode(encoding) for name, raw in unclear.items()}
-        except UnicodeDecodeError:
-            continue
-        photos[encoding] = {
-            name: found[0] for name, text in read.items() if (found := files.photo(text)) is not None
-        }
+        with suppress(UnicodeDecodeError):
+            readings[encoding] = {name: raw.decode(encoding) for name, raw in unclear.items()}
+    best, said = chosen(readings, files, "the COLMAP model")
+    if best is None:
+        return _named(model, {name: raw.decode("utf-8", "replace") for name, raw in unclear.items()}), ()
+    return _named(model, readings[best]), said
+
+
+Key = TypeVar("Key")
+
+
+class NamesUnclear(ValueError):
+    """Two encodings of the names lead to different photos. The message has both readings."""
+
+
+def chosen(
+    readings: Mapping[str, Mapping[Key, str]], files: ImageFiles, file: str
+) -> tuple[str | None, tuple[str, ...]]:
+    """The encoding in which the most names are those of photos, and a sentence that says so; None where none is.
+
+    readings: the names as each encoding of zips has them. file: what they were read from, in a sentence.
+
+    Raises NamesUnclear where two encodings lead to different photos.
+    """
+    photos = {
+        encoding: {key: found[0] for key, text in names.items() if (found := files.photo(text)) is not None}
+        for encoding, names in readings.items()
+    }
     most = max(map(len, photos.values()), default=0)
     if not most:
-        return _named(model, {name: raw.decode("utf-8", "replace") for name, raw in unclear.items()}), ()
-    best = [encoding for encoding, found in photos.items() if len(found) == most]
-    first = best[0]
-    for other in best[1:]:
-        if photos[other] != photos[first]:
-            name = next(
-                name for name in sorted(unclear) if photos[other].get(name) != photos[first].get(name)
-            )
-            raise ValueError(
-                "The names in the COLMAP model are not UTF-8, and two readings of them lead to different photos: as "
-                f"{label(first)}, one is {unclear[name].decode(first)!r}, and as {label(other)}, "
-                f"{unclear[name].decode(other)!r}. Give the photos names in ASCII, or leave out those that do not "
-                "belong to the model."
-            )
-    example = min(photos[first])
-    said = (
-        f"The names in the COLMAP model are not UTF-8. They are read as {label(first)}, as the photos are called: "
-        f"{unclear[example].decode(first)}."
+        return None, ()
+    first, *others = [encoding for encoding, found in photos.items() if len(found) == most]
+    for other in others:
+        for key, name in readings[first].items():
+            if photos[other].get(key) != photos[first].get(key):
+                raise NamesUnclear(
+                    f"The names in {file} are not UTF-8, and two readings of them lead to different photos: as "
+                    f"{label(first)}, one is {name!r}, and as {label(other)}, {readings[other][key]!r}. Give the "
+                    "photos names in ASCII, or leave out those that do not belong to the cameras."
+                )
+    example = next((name for key in photos[first] if not (name := readings[first][key]).isascii()), None)
+    if example is None:
+        return first, ()
+    return first, (
+        f"The names in {file} are not UTF-8. They are read as {label(first)}, as the photos are called: {example}.",
     )
-    return _named(model, {name: raw.decode(first) for name, raw in unclear.items()}), (said,)
 
 
 def _bytes(name: str) -> bytes | None:

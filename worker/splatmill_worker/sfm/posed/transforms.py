@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, overload
@@ -20,12 +21,14 @@ from splatmill.data_sets import keyframes
 from splatmill.schema.quantities import format_bytes, listed
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.errors import Refusal, UnusablePicture
+from splatmill_worker.images.archives.zip_names import ENCODINGS
 from splatmill_worker.images.decoding import decoders
 from splatmill_worker.readers import point_file
 from splatmill_worker.scene import Scene, Source, View, viewmat_of
 from splatmill_worker.sfm.posed import parts, polycam
 from splatmill_worker.sfm.posed.camera_models import UnreadModel, is_fisheye
 from splatmill_worker.sfm.posed.colmap_model import camera_and_lens, fit_to_file
+from splatmill_worker.sfm.posed.encodings import NamesUnclear, chosen
 from splatmill_worker.sfm.posed.files import ImageFiles, missing, none_usable, readings
 from splatmill_worker.sfm.posed.model_files import MAX_DISTANCE, MAX_PARAMETER, MAX_SIDE, MOST_FAULTY
 from splatmill_worker.sfm.posed.one_camera import one_for_each
@@ -66,7 +69,8 @@ def load(
     messages = list(notes)
     warnings: list[str] = []
     points = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
-    for path, document in _documents(paths):
+    for path, document, said in _documents(paths, files):
+        warnings += said
         if path.is_dir():
             polycam.check_photos(path, files.photos)
         part = parts.of_file(path)
@@ -158,21 +162,25 @@ def load(
     )
 
 
-def _documents(paths: Sequence[Path]) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """Each transforms document with its path; the files of Polycam are one document, with the path of their folder."""
+def _documents(
+    paths: Sequence[Path], files: ImageFiles
+) -> Iterator[tuple[Path, dict[str, Any], tuple[str, ...]]]:
+    """Each transforms document with its path, and sentences on how it was read; the files of Polycam are one document,
+    with the path of their folder."""
     if all(keyframes(f"{path.parent.as_posix()}/") for path in paths):
-        yield paths[0].parent, polycam.document(paths, _parsed)
+        yield paths[0].parent, polycam.document(paths, lambda path: _parsed(path, files)[0]), ()
         return
     for path in paths:
-        document = _parsed(path)
+        document, said = _parsed(path, files)
         if not isinstance(document, dict) or not isinstance(document.get("frames"), list):
             raise ValueError(
                 f"{path.name} has no list `frames`. Give a transforms file with one entry in `frames` per photo."
             )
-        yield path, document
+        yield path, document, said
 
 
-def _parsed(path: Path) -> Any:
+def _parsed(path: Path, files: ImageFiles) -> tuple[Any, tuple[str, ...]]:
+    """The value in a JSON file, and sentences on how its text was read where it is not UTF-8 (or UTF-16 or UTF-32)."""
     size = path.stat().st_size
     if size > MAX_FILE_BYTES:
         raise ValueError(f"{path.name} has {size} bytes; at most {MAX_FILE_BYTES} are read.")
@@ -180,9 +188,30 @@ def _parsed(path: Path) -> Any:
         text = path.read_bytes()
         if parsed_bytes(text) > MAX_PARSED_BYTES:
             raise ValueError(f"its lists and objects would take {format_bytes(parsed_bytes(text))} of memory")
-        return json.loads(text)
+        try:
+            return json.loads(text), ()
+        except UnicodeDecodeError:
+            names: dict[str, dict[int, str]] = {}
+            for encoding in ENCODINGS:
+                # The text is decoded before it is parsed: in some encodings, a letter has the byte of a backslash.
+                with suppress(ValueError):
+                    names[encoding] = _file_paths(json.loads(text.decode(encoding)))
+            best, said = chosen(names, files, path.name)
+            return json.loads(text.decode(best or "utf-8", "replace")), said
+    except NamesUnclear:
+        raise
     except (OSError, ValueError, RecursionError) as error:
         raise ValueError(f"{path.name} is not readable JSON: {plain(error)}.") from error
+
+
+def _file_paths(document: Any) -> dict[int, str]:
+    """The file_path of each frame of a document that has one, by the frame's number."""
+    frames = document.get("frames") if isinstance(document, dict) else None
+    return {
+        index: frame["file_path"]
+        for index, frame in enumerate(frames if isinstance(frames, list) else ())
+        if isinstance(frame, dict) and isinstance(frame.get("file_path"), str)
+    }
 
 
 def parsed_bytes(text: bytes) -> int:
