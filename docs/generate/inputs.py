@@ -20,9 +20,10 @@ from splatmill.schema.files.photos import (
 )
 from splatmill_worker.images import guarded, mask_levels, overlay, prepare
 from splatmill_worker.images.archives import archive, zip_names
-from splatmill_worker.images.colors import PRIMARIES, TRANSFERS
+from splatmill_worker.images.colors import PRIMARIES, TRANSFERS, Colors
 from splatmill_worker.images.lens import PINHOLE_MODELS
 from splatmill_worker.images.no_photo import TRAITS
+from splatmill_worker.images.photo_colors import PhotoColors
 from splatmill_worker.readers.colmap_files import MODELS
 from splatmill_worker.scene import MIN_SHOWN
 from splatmill_worker.sfm.posed import colmap_model, model_files, points, polycam, triangulation
@@ -96,12 +97,14 @@ def _photos() -> list[str]:
             ["in the file, by its number in H.273", "read as"],
             [*_codes("primaries", PRIMARIES), *_codes("transfer", TRANSFERS)],
         ),
-        """Colours are brought to sRGB with 8 bits per channel. A photo is read by its ICC profile, or else by its tags,
-        the chunks sRGB, gAMA and cHRM of PNG, or EXIF (Adobe RGB, other primaries, a power); in a PNG, cICP comes
+        f"""Colours are brought to sRGB with 8 bits per channel. A photo is read by its ICC profile, or else by its
+        tags, the chunks sRGB, gAMA and cHRM of PNG, or EXIF (Adobe RGB, other primaries, a power); in a PNG, cICP comes
         first. A video is read by its tags. PQ and HLG are converted by one rule, which
         [Photographing](photographing.md#what-can-be-given) has. Photos of 10 or 16 bits are reduced to 8 before that,
-        by less than one level: a photo in PQ then has steps of two levels, and one in linear light has bands in its
-        shadows, of up to 13. Of a photo with a gain map, the SDR picture is used. CMYK and LAB are converted too. Grey
+        by less than one level: neighbouring tones are then up to
+        {PhotoColors(tags=Colors("BT.2020", "PQ")).largest_step()} levels apart for PQ, and up to
+        {PhotoColors(tags=Colors("sRGB", "linear")).largest_step()} in the shadows of linear light, and the report says
+        so. Of a photo with a gain map, the SDR picture is used. CMYK and LAB are converted too. Grey
         floating-point numbers are taken as sRGB from 0 to 1, and left out if they reach further; coloured ones are
         refused, since they may be linear light as well. The report says what was converted or assumed.""",
         "### Zips\n",

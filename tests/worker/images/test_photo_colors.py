@@ -23,8 +23,9 @@ from PIL import Image, ImageCms
 
 from splatmill_worker.errors import UnusablePicture
 from splatmill_worker.images import decode, examine
-from splatmill_worker.images.colors import Colors, _rgb_to_xyz, _to_srgb
+from splatmill_worker.images.colors import ADOBE_RGB, Colors, _rgb_to_xyz, _to_srgb, srgb
 from splatmill_worker.images.decoding import decoders
+from splatmill_worker.images.photo_colors import PhotoColors
 from splatmill_worker.images.prepare import prepare
 from splatmill_worker.sfm import posed
 from tests.worker.images.video.test_video_frame import (
@@ -288,7 +289,7 @@ def test_a_png_is_read_by_the_first_of_its_chunks(
     bright = chart() > (120 if power == 1.0 else 0)
     assert np.abs((read(path) - chart()) * bright).mean() < 1.5
     remark = f"converted to sRGB from {named}" if named else ""
-    assert decoders.photo_colors(path, "a") == remark
+    assert decoders.photo_colors(path, "a").partition(";")[0] == remark
 
 
 def adobe_space(space: int, **tags: Any) -> Image.Exif:
@@ -394,6 +395,48 @@ def test_a_fine_ramp_of_sixteen_bits_is_neither_banded_nor_clipped(suffix: str, 
     ):
         assert np.abs(values[8] - ramp[8] / 257.0).max() < 1.0
         assert len(np.unique(values[8])) == 256
+
+
+@pytest.mark.parametrize("suffix", ["png", "tif"])
+def test_grey_of_sixteen_bits_is_rounded_to_the_nearest_level(suffix: str, tmp_path: Path) -> None:
+    deep = np.arange(65536, dtype=np.uint16).reshape(128, 512)
+    Image.fromarray(deep).save(tmp_path / f"g.{suffix}")
+    values = np.asarray(decode.decode(tmp_path / f"g.{suffix}"), np.float64)
+    assert np.abs(values - deep / 257.0).max() <= 0.5
+
+
+@pytest.mark.parametrize(
+    ("tags", "step"),
+    [
+        (Colors("BT.2020", "PQ"), 4),
+        (Colors("BT.2020", "HLG"), 2),
+        (Colors("sRGB", "linear"), 13),
+        (Colors("sRGB", "gamma 1.8"), 2),
+        (Colors("Display P3", "sRGB"), 1),
+        (ADOBE_RGB, 2),
+    ],
+)
+def test_tones_that_are_lost_are_said_with_the_figure(tags: Colors, step: int) -> None:
+    colors = PhotoColors(tags=tags)
+    assert colors.largest_step() == step
+    assert (f" {step} of 255 levels" in colors.remark("RGB")) == (step > 2)
+
+
+def test_a_linear_profile_is_said_to_lose_tones_as_linear_tags_are() -> None:
+    profile = icc(b"RGB ", "linear", colorants("Display P3"), 1.0)
+    assert PhotoColors(profile).largest_step() == 13
+    assert " 13 of 255 levels" in PhotoColors(profile).remark("RGB")
+    assert "levels" not in PhotoColors(DISPLAY_P3).remark("RGB")
+
+
+@pytest.mark.parametrize(
+    "colors", [Colors("BT.2020", "PQ"), Colors("BT.2020", "HLG"), Colors("sRGB", "PQ")], ids=str
+)
+def test_hdr_photos_are_converted_as_the_rule_has_it_in_all_colours(colors: Colors) -> None:
+    grey = np.repeat(np.arange(256)[:, None], 3, axis=1)
+    values = np.concatenate([grey, np.random.default_rng(0).integers(0, 256, (4096, 3))]).astype(np.uint8)
+    converted = np.asarray(PhotoColors(tags=colors).srgb(Image.fromarray(values[None])), np.float64)[0]
+    assert np.abs(converted - srgb(values / 255.0, colors) * 255.0).max() <= 0.75
 
 
 def test_photos_that_come_with_cameras_are_named_too(tmp_path: Path) -> None:

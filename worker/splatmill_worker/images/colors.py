@@ -20,9 +20,13 @@ import numpy.typing as npt
 
 Values = npt.NDArray[np.float64]
 Table = npt.NDArray[np.float32]
+Pixels = npt.NDArray[np.uint8]
 
 SIDE = 64
 """Entries along each side of a table of colours: that of a Hald picture of level 8, and at most 65 for Pillow."""
+
+BLOCK = 2**18
+"""Pixels that are converted at a time, which bounds the memory."""
 
 KNEE = 0.83
 """Linear light, of reference white, above which HDR highlights are compressed: the brightest patch of a grey scale
@@ -118,7 +122,26 @@ def srgb_table(colors: Colors, white: float = 1.0) -> Table:
 
 def srgb(values: Values, colors: Colors) -> Values:
     """Values [...,3] from 0 to 1 of `colors`, as sRGB values from 0 to 1."""
-    light = _linear(values, colors.transfer) @ _to_srgb(colors.primaries).T
+    return _of_light(_linear(values, colors.transfer), colors)
+
+
+def srgb_pixels(pixels: Pixels, colors: Colors) -> Pixels:
+    """Pixels [H,W,3] of 8 bits per channel of `colors`, as those of sRGB, by the rule itself.
+
+    Of HDR, a table of colours would be off by up to 30 levels: between its entries, bright colours differ too much.
+    """
+    light = _linear(np.arange(256) / 255.0, colors.transfer)
+    converted = np.empty_like(pixels)
+    rows = max(1, BLOCK // pixels.shape[1])
+    for first in range(0, len(pixels), rows):
+        block = slice(first, first + rows)
+        converted[block] = np.rint(_of_light(light[pixels[block]], colors) * 255.0)
+    return converted
+
+
+def _of_light(light: Values, colors: Colors) -> Values:
+    """Light [...,3] of `colors`, of white or of reference white, as sRGB values from 0 to 1."""
+    light = light @ _to_srgb(colors.primaries).T
     luminance = light @ _rgb_to_xyz("sRGB")[1]
     least = light.min(axis=-1)
     outside = least < 0.0

@@ -199,4 +199,5 @@ def _to_8_bits(values: npt.NDArray[np.generic]) -> Pixels:
     if np.issubdtype(values.dtype, np.floating):
         return np.asarray(np.clip(np.nan_to_num(values) * 255.0 + 0.5, 0, 255), np.uint8)
     wide = values.astype(np.int64)
-    return np.asarray(np.clip(wide >> 8 if wide.max(initial=0) > 255 else wide, 0, 255), np.uint8)
+    # The whole of 16 bits is 257 times that of 8, to the nearest level.
+    return np.asarray(np.clip((wide + 128) // 257 if wide.max(initial=0) > 255 else wide, 0, 255), np.uint8)

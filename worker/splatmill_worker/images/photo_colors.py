@@ -26,6 +26,7 @@ from splatmill_worker.images.colors import (
     SRGB_GAMMA,
     TRANSFERS,
     Colors,
+    srgb_pixels,
     srgb_table,
     with_srgb_transfer,
 )
@@ -45,6 +46,9 @@ SRGB_POINTS = (0.3127, 0.3290, 0.64, 0.33, 0.30, 0.60, 0.15, 0.06)
 
 LIKE_SRGB = 2
 """Largest difference in grey levels of a profile from sRGB that is left as it is: about that of rounding."""
+
+FINE_STEP = 2
+"""Grey levels between neighbouring tones that are not reported: curves near that of sRGB have as many by rounding."""
 
 MAX_NAME = 60
 """Characters of the name of a profile that are read."""
@@ -91,7 +95,25 @@ class PhotoColors:
         return PhotoColors(tags=named)
 
     def remark(self, mode: str) -> str:
-        """How the colours of a picture of Pillow's `mode` become sRGB, as a part of a sentence; "" if they are sRGB."""
+        """How the colours of a picture of Pillow's `mode` become sRGB, and whether tones are lost, as a part of a
+        sentence; "" if they are sRGB."""
+        conversion = self._conversion(mode)
+        step = self.largest_step(mode) if conversion and Image.getmodebase(mode) in ("L", "RGB") else 0
+        if step <= FINE_STEP:
+            return conversion
+        return (
+            f"{conversion}; photos are read with 8 bits, so that neighbouring tones are up to {step} of 255 levels "
+            "apart and may show as bands: save such photos with the curve of sRGB"
+        )
+
+    def largest_step(self, mode: str = "RGB") -> int:
+        """Grey levels of sRGB between neighbouring ones of a picture of `mode`, at most."""
+        ramp = Image.fromarray(np.arange(256, dtype=np.uint8)[None]).convert(Image.getmodebase(mode))
+        grey = np.asarray(self.srgb(ramp).convert("RGB"), int)[0, :, 1]
+        return int(np.diff(grey).max())
+
+    def _conversion(self, mode: str) -> str:
+        """How the colours of a picture of `mode` become sRGB, as a part of a sentence."""
         if self.profile is None:
             if self.tags.hdr:
                 return f"converted to SDR from HDR ({self.tags})"
@@ -117,7 +139,12 @@ class PhotoColors:
         if photo.mode not in ("RGB", "RGBA"):
             photo = photo.convert("RGB")
         colors = self.tags
-        if not colors.hdr and colors.transfer != "sRGB":
+        if colors.hdr:
+            converted = Image.fromarray(srgb_pixels(np.asarray(photo.convert("RGB")), colors))
+            if photo.mode == "RGBA":
+                converted.putalpha(photo.getchannel("A"))
+            return converted
+        if colors.transfer != "sRGB":
             # A curve has an entry for each value, which the table of colours has not.
             photo = photo.point(_curve(colors.transfer) * 3 + list(range(256)) * (len(photo.mode) - 3))
             colors = Colors(colors.primaries, "sRGB")
