@@ -338,29 +338,26 @@ def _masks(pictures: list[str], top: str, photo_root: str) -> dict[str, str]:
 
 
 def _poses(cameras: Cameras, names: list[str]) -> dict[str, str]:
-    """Return the local name of each pose file, with its name in the capture."""
+    """Return the local name of each pose file, with its name in the capture: that in the data set."""
     poses = {name: name.removeprefix(cameras.top) for name in cameras.transforms}
-    places: list[str] = []
     for folder in cameras.models:
-        # In a capture, COLMAP models always lie in the folders sparse/N.
-        number = folder.rstrip("/").rpartition("/")[2]
-        if not number.isdecimal() or number in places:
-            number = next(str(free) for free in range(len(places) + 1) if str(free) not in places)
-        places.append(number)
         for name in names:
-            base = name.removeprefix(folder)
-            stem, suffix = os.path.splitext(base.lower())
+            stem, suffix = os.path.splitext(name.removeprefix(folder).lower())
             if name.startswith(folder) and stem in MODEL_STEMS and suffix in MODEL_SUFFIXES:
-                poses[name] = f"sparse/{number}/{base}"
+                poses[name] = name.removeprefix(cameras.top)
     return poses
 
 
 def _documents(root: Path, cameras: Cameras) -> list[dict[str, Any]]:
-    """The transforms files. One that cannot be read is left out here; the worker says what is wrong with it."""
+    """The transforms files. One that cannot be read is left out here; the worker says what is wrong with it.
+
+    Of one in another encoding than Unicode's, the names in ASCII are read.
+    """
     documents = []
     for name in cameras.transforms:
         try:
-            document = json.loads((root / name).read_bytes())
+            text = (root / name).read_bytes()
+            document = json.loads(text.decode(json.detect_encoding(text), "replace"))
         except (OSError, ValueError, RecursionError):
             continue
         if isinstance(document, dict):

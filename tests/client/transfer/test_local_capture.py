@@ -112,7 +112,24 @@ def test_a_colmap_model_is_found_where_tools_put_it(tmp_path: Path):
     for folder in ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse"):
         root = tmp_path / folder.replace("/", "_")
         tree(root, "images/a.jpg", *(f"{folder}/{name}" for name in model), f"{folder}/project.ini")
-        assert roles(root)[Role.poses] == [f"sparse/0/{name}" for name in model]
+        assert roles(root)[Role.poses] == [f"{folder}/{name}" for name in model]
+
+
+def test_a_model_keeps_its_place_in_the_data_set_so_that_messages_name_it(tmp_path: Path):
+    for folder, place in (
+        ("", ""),
+        ("scan/", ""),
+        ("scan/0/", "0/"),
+        ("scan/colmap/sparse/", "colmap/sparse/"),
+    ):
+        root = tmp_path / f"of-{folder.replace('/', '_')}"
+        top = "scan/" if folder else ""
+        tree(root, f"{top}images/a.jpg", f"{folder}cameras.txt", f"{folder}images.txt")
+        capture = roles(root)[Role.poses]
+        assert capture == [f"{place}cameras.txt", f"{place}images.txt"]
+        cameras = find_cameras(capture)
+        assert cameras is not None
+        assert cameras.models == (place,)
 
 
 def test_all_models_of_a_mapper_are_sent_because_the_largest_is_chosen_by_its_photos(tmp_path: Path):
@@ -153,7 +170,7 @@ def test_a_data_set_some_folders_down_is_found(tmp_path: Path, kind: str):
     assert [Path(file.name).name for file in found.files if file.role is Role.images] == ["a.jpg", "b.jpg"]
     sent = [file.name for file in found.files if file.role is Role.poses]
     assert len(sent) == len([name for name in poses if name != "readme.txt"])
-    assert all(name.startswith(("sparse/0/", "transforms.json")) for name in sent)
+    assert all(f"{top}{name}" in poses for name in sent)
 
 
 def test_two_data_sets_side_by_side_are_refused_with_both_named(tmp_path: Path):

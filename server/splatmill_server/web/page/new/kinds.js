@@ -268,21 +268,15 @@ function numberOf(folder) {
   return /(?:^|\/)(\d+)\/$/.exec(folder)?.[1] ?? null;
 }
 
-/** The name in the capture of each path that is a pose file. @param {Cameras} cameras @param {string[]} paths */
+/** The name in the capture, which is that in the data set, of each path that is a pose file. @param {Cameras} cameras @param {string[]} paths */
 function namesOf(cameras, paths) {
   /** @type {Map<string, string>} */
   const poses = new Map(cameras.transforms.map((path) => [path, path.slice(cameras.top.length)]));
-  /** @type {string[]} */
-  const places = [];
   for (const folder of cameras.models) {
-    let number = numberOf(folder);
-    for (let free = 0; number === null || places.includes(number); free++) number = String(free);
-    places.push(number);
     for (const path of paths.filter((one) => one.startsWith(folder))) {
-      const base = path.slice(folder.length);
       const ending = suffix(path);
-      const stem = base.slice(0, base.length - ending.length).toLowerCase();
-      if (MODEL_STEMS.includes(stem) && MODEL_SUFFIXES.includes(ending)) poses.set(path, `sparse/${number}/${base}`);
+      const stem = path.slice(folder.length, path.length - ending.length).toLowerCase();
+      if (MODEL_STEMS.includes(stem) && MODEL_SUFFIXES.includes(ending)) poses.set(path, path.slice(cameras.top.length));
     }
   }
   return poses;
