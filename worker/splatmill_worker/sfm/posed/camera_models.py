@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
+from splatmill.schema.files.photos import MIN_PHOTO_SIDE
+from splatmill_worker.colmap import pycolmap
 from splatmill_worker.images.prepare import CUT_PANORAMAS
 from splatmill_worker.readers.colmap_files import MODELS
 
@@ -18,6 +21,15 @@ PANORAMIC = ("EQUIRECTANGULAR", "SPHERICAL", "LATLONG", "OMNIDIRECTIONALSTEREO",
 
 OTHER_LENSES = {"latlong": "LATLONG", "equirectangular": "EQUIRECTANGULAR", "ftheta_p0": "FTHETA"}
 """Fields by which transforms.json of instant-ngp has another lens."""
+
+
+MIN_FOCAL = 0.02
+"""Focal length over the longer side below which intrinsics are not in pixels: a pinhole would show 175 degrees across,
+and an equidistant lens more than a whole turn."""
+
+
+class IntrinsicsNotInPixels(ValueError):
+    """Intrinsics of a camera that are given in another unit than pixels or radians. The message has both readings."""
 
 
 class UnreadModel(ValueError):
@@ -41,6 +53,36 @@ class UnreadModel(ValueError):
             "Give undistorted photos with pinhole cameras, which most programs can write, or remove the cameras to "
             "have them recovered from the photos.",
         )
+
+
+def check_pixels(camera: pycolmap.Camera) -> None:
+    """Raise IntrinsicsNotInPixels where the focal lengths or the principal point of a camera can only be parts of the
+    sides."""
+    width, height = camera.width, camera.height
+    focal = min(camera.focal_length_x, camera.focal_length_y)
+    place = camera.principal_point_x, camera.principal_point_y
+    small = focal < MIN_FOCAL * max(width, height)
+    corner = min(place) > 0.0 and max(place) <= 1.0 and min(width, height) >= MIN_PHOTO_SIDE
+    if small or corner:
+        what = (
+            f"the focal length is {focal:.4g}"
+            if small
+            else f"the principal point is ({place[0]:.4g}, {place[1]:.4g})"
+        )
+        raise IntrinsicsNotInPixels(
+            f"{what} for a photo of {width} x {height} pixels; intrinsics are in pixels. If these are parts of the "
+            "sides, multiply those of x by the width, and those of y by the height"
+        )
+
+
+def radians(name: str, angle: float) -> float:
+    """The angle of view that the field `name` has. Raises IntrinsicsNotInPixels for one of half a turn or more."""
+    if not 0.0 < angle < math.pi:
+        raise IntrinsicsNotInPixels(
+            f"{name} is {angle:.6g}; it is an angle in radians, and less than pi. If it is in degrees, give "
+            f"{math.radians(angle):.6g}"
+        )
+    return angle
 
 
 def is_panoramic(name: str) -> bool:

@@ -15,7 +15,7 @@ from splatmill_worker.images.decoding import decoders
 from splatmill_worker.readers import colmap_files
 from splatmill_worker.readers.colmap_files import Arrays
 from splatmill_worker.sfm.posed import camera_models
-from splatmill_worker.sfm.posed.camera_models import UnreadModel
+from splatmill_worker.sfm.posed.camera_models import IntrinsicsNotInPixels, UnreadModel
 
 MAX_SIDE = 1_000_000
 """Pixels of a side of a camera."""
@@ -160,6 +160,10 @@ def _cameras(arrays: Arrays) -> dict[int, pycolmap.Camera]:
         focal = [parameters[index] for index in camera.focal_length_idxs()]
         if not (np.abs(parameters).max() <= MAX_PARAMETER and min(focal, default=1.0) > 0.0):
             raise ValueError(f"Camera {number} of the COLMAP model has the parameters {parameters.tolist()}.")
+        try:
+            camera_models.check_pixels(camera)
+        except IntrinsicsNotInPixels as error:
+            raise IntrinsicsNotInPixels(f"Camera {number} of the COLMAP model: {error}.") from error
         cameras[number] = camera
     return cameras
 

@@ -26,7 +26,7 @@ from splatmill_worker.images.decoding import decoders
 from splatmill_worker.readers import point_file
 from splatmill_worker.scene import Scene, Source, View, viewmat_of
 from splatmill_worker.sfm.posed import parts, polycam
-from splatmill_worker.sfm.posed.camera_models import UnreadModel, is_fisheye
+from splatmill_worker.sfm.posed.camera_models import UnreadModel, check_pixels, is_fisheye, radians
 from splatmill_worker.sfm.posed.colmap_model import camera_and_lens, fit_to_file
 from splatmill_worker.sfm.posed.encodings import NamesUnclear, chosen
 from splatmill_worker.sfm.posed.files import ImageFiles, missing, none_usable, readings
@@ -363,7 +363,9 @@ def _colmap_camera(values: dict[str, Any], size: tuple[int, int]) -> pycolmap.Ca
 
     def focal(length: str, angle: str, side: int) -> float | None:
         given, seen = _number(values, length), _number(values, angle)
-        return given if given is not None or seen is None else 0.5 * side / math.tan(0.5 * seen)
+        return (
+            given if given is not None or seen is None else 0.5 * side / math.tan(0.5 * radians(angle, seen))
+        )
 
     horizontal = focal("fl_x", "camera_angle_x", width)
     vertical = focal("fl_y", "camera_angle_y", height)
@@ -385,7 +387,9 @@ def _colmap_camera(values: dict[str, Any], size: tuple[int, int]) -> pycolmap.Ca
         model, extra = "FULL_OPENCV", [*radial[:2], *tangential, *radial[2:]]
     else:
         model, extra = "OPENCV", [*radial[:2], *tangential]
-    return pycolmap.Camera(model=model, width=width, height=height, params=[fx, fy, cx, cy, *extra])
+    camera = pycolmap.Camera(model=model, width=width, height=height, params=[fx, fy, cx, cy, *extra])
+    check_pixels(camera)
+    return camera
 
 
 def _within(path: Path, capture: Path) -> bool:
