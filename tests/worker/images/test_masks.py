@@ -217,3 +217,33 @@ def test_a_failure_names_what_is_wrong_with_the_masks(tmp_path: Path) -> None:
             lambda: False,
         )
     assert failed.value.code == "too_few_images"
+
+
+@pytest.mark.parametrize("posed_too", [False, True])
+def test_pictures_in_the_folder_of_masks_are_refused_as_previews_of_masks(
+    tmp_path: Path, posed_too: bool
+) -> None:
+    frames = []
+    for number in range(4):
+        photo(tmp_path / f"images/{number}.png", number)
+        photo(tmp_path / f"masks/{number}.png", number + 10)
+        matrix = np.eye(4)
+        matrix[0, 3] = number
+        frames.append({"file_path": f"images/{number}.png", "transform_matrix": matrix.tolist()})
+    (tmp_path / "transforms.json").write_text(json.dumps({"camera_angle_x": 1.0, "frames": frames}))
+    given = posed.find(tmp_path)
+    assert given is not None
+    with pytest.raises(Refusal) as refused:
+        given.load() if posed_too else prepared(tmp_path, "masks")
+    assert refused.value.code == "no_images"
+    assert "are neither black nor white" in str(refused.value)
+
+
+def test_masks_with_soft_edges_and_pictures_of_grey_labels_are_used(tmp_path: Path) -> None:
+    soft = np.tile(np.clip(np.arange(64) * 32 - 600, 0, 255).astype(np.uint8), (48, 1))
+    labels = np.repeat(np.arange(0, 256, 32, dtype=np.uint8), 8)[None].repeat(48, axis=0)
+    for number, levels in enumerate((soft, soft, labels)):
+        photo(tmp_path / f"images/{number}.png", number)
+        (tmp_path / "masks").mkdir(exist_ok=True)
+        Image.fromarray(levels).save(tmp_path / f"masks/{number}.png")
+    assert all(one.mask is not None for one in prepared(tmp_path, "masks").photos)

@@ -15,6 +15,15 @@ from splatmill_worker.scene import MIN_SHOWN
 MAX_HIDDEN = 0.5
 """Share of the pixels of all photos that masks may hide without a warning."""
 
+MAX_BETWEEN = 0.25
+"""Share of the pixels of masks that may lie between black and white, as soft edges do; of pictures, most do."""
+
+BETWEEN = range(32, 224)
+"""Levels that are neither black nor white."""
+
+MOST_LEVELS = 32
+"""Levels between black and white that masks may have, as pictures of labels do, however many pixels have them."""
+
 
 @dataclass(frozen=True)
 class Judged:
@@ -38,8 +47,8 @@ def judged(masks: Mapping[str, Path | None], unused: Collection[str]) -> Judged:
     masks: of each photo, by its name; None where it has none.
     unused: names of the masks that belong to no photo.
 
-    Raises Refusal where the masks hide all pixels of every photo. A mask that does not decode is not measured: it ends
-    the loading of photos.
+    Raises Refusal where the masks hide all pixels of every photo, and where they are pictures, such as previews of
+    masks over the photos. A mask that does not decode is not measured: it ends the loading of photos.
     """
     warnings = _unused(unused)
     own = {name: mask for name, mask in masks.items() if mask is not None}
@@ -47,6 +56,7 @@ def judged(masks: Mapping[str, Path | None], unused: Collection[str]) -> Judged:
         measured = zip(own, pool.map(_levels, own.values()), strict=True)
         counts = {name: levels for name, levels in measured if levels is not None}
     present = [level for level in range(256) if any(levels[level] for levels in counts.values())]
+    _check_masks(counts, present)
     shown_from = MIN_SHOWN
     if len(present) == 2 and (present[1] < MIN_SHOWN or present[0] >= MIN_SHOWN):
         hides, shown_from = present
@@ -77,6 +87,21 @@ def judged(masks: Mapping[str, Path | None], unused: Collection[str]) -> Judged:
         )
     note = f"{len(own)} of {len(masks)} photos have a mask; the masks hide {share:.0%} of their pixels."
     return Judged(shown_from, (note,), tuple(warnings))
+
+
+def _check_masks(counts: Mapping[str, list[int]], present: Collection[int]) -> None:
+    """Raise Refusal where masks are pictures by their levels. counts: pixels of each level, by the names of photos."""
+    between = {name: sum(levels[level] for level in BETWEEN) / sum(levels) for name, levels in counts.items()}
+    share = sum(between.values()) / max(1, len(between))
+    if share <= MAX_BETWEEN or len(set(present).intersection(BETWEEN)) <= MOST_LEVELS:
+        return
+    raise Refusal(
+        "no_images",
+        f"The masks of {len(counts)} photos seem to be pictures: {share:.0%} of their pixels are neither black nor "
+        f"white, most in that of {max(between, key=lambda name: between[name])}.",
+        advice="Draw in white (255) what is trained on, and in black (0) what is hidden, or leave the masks out. If "
+        "they are photos, put them beside the others, into a folder of another name.",
+    )
 
 
 def _unused(names: Collection[str]) -> list[str]:

@@ -292,3 +292,22 @@ def test_a_photo_of_another_shape_than_its_camera_is_left_out(tmp_path: Path, wr
     assert "64 x 36 pixels, another shape than the 64 x 48" in next(
         v for k, v in reasons.items() if NAMES[3] in k
     )
+
+
+# Names as in addresses.
+
+
+def test_names_written_as_in_addresses_are_those_of_the_photos(tmp_path: Path) -> None:
+    names = ["my view 1.jpg", "Küche.jpg", "100%.jpg", "a%20b.jpg", "a b.jpg"]
+    photos(tmp_path / "images", names)
+    transforms(tmp_path / "transforms.json", frames(["my%20view%201.jpg", "K%C3%BCche.jpg", *names[2:]]))
+    scene = loaded(tmp_path)
+    check(scene, {name: k for k, name in enumerate(names)})
+    assert scene.left_out == ()
+
+
+def test_cameras_of_other_photos_are_refused_with_a_photo_that_there_is(tmp_path: Path) -> None:
+    photos(tmp_path / "images", ["IMG_0.jpg", "IMG_1.jpg"])
+    transforms(tmp_path / "transforms.json", frames(["x.jpg", "y.jpg"]))
+    with pytest.raises(ValueError, match=r"x\.jpg.*IMG_0\.jpg"):
+        loaded(tmp_path)

@@ -17,7 +17,7 @@ from splatmill_worker.readers.colmap_files import place
 from splatmill_worker.scene import Camera, Lens, PointViews, Scene, Source, View
 from splatmill_worker.sfm.posed import model_files
 from splatmill_worker.sfm.posed.encodings import decoded
-from splatmill_worker.sfm.posed.files import ImageFiles, missing, none_usable, readings
+from splatmill_worker.sfm.posed.files import ImageFiles, instead, missing, none_usable, readings
 from splatmill_worker.sfm.posed.model_files import GivenModel, ModelPoints
 from splatmill_worker.sfm.posed.one_camera import one_for_each
 
@@ -80,11 +80,6 @@ def _path(files: ImageFiles, name: str) -> Path | None:
     return None if found is None else found[1]
 
 
-def _instead(files: ImageFiles) -> str:
-    """A photo that there is, as a part of a sentence."""
-    return "".join(f": a photo of it is {name!r}" for name in list(files.photos)[:1])
-
-
 def _shown(folder: Path) -> str:
     return place(folder) or "the one beside the photos"
 
@@ -117,7 +112,7 @@ def scene_of_given(model: GivenModel, files: ImageFiles, notes: tuple[str, ...] 
         several = readings(first := lacking[0][0], files)
         raise ValueError(
             f"The COLMAP model names {len(lacking)} photos (such as {first!r}), and the capture has "
-            + (f"several of this name: {several}." if several else f"none of them{_instead(files)}.")
+            + (f"several of this name: {several}." if several else f"none of them{instead(files)}.")
             + " Give the photos the names that the model uses."
         )
     copies, copy_warnings = files.copies({view.image for view in views.values()})

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Literal
+from urllib.parse import unquote
 
 from splatmill.data_sets import walk
 from splatmill.schema.files.masks import masks_beside, paired, without_mask_folder
@@ -65,8 +66,8 @@ class ImageFiles:
 
         It is the photo with the most trailing path components in common, the file name at least. When no file name
         agrees, the suffix may be missing or differ. Names in another case, or in another form of Unicode, count where
-        none agrees exactly. Of one photo in several sizes (images_2/, images_4/), it is the largest. A photo that was
-        renamed for storage is found by the name it had.
+        none agrees exactly, and then those written as in addresses (`a%20b.jpg`). Of one photo in several sizes
+        (images_2/, images_4/), it is the largest. A photo that was renamed for storage is found by the name it had.
         """
         best = self.candidates(name)
         found = best[0] if len(best) == 1 else self._largest(best)
@@ -111,7 +112,7 @@ class ImageFiles:
 
     def candidates(self, name: str) -> list[str]:
         """The photos that `name` fits equally well."""
-        best = self._fitting(name)
+        best = self._fitting(name) or self._fitting(unquote(name))
         # A colon is changed only where the name begins with its letter, so both the path and its last part are tried.
         for changed in () if best else (name, name.rpartition("/")[2]):
             with suppress(UnsafeName):
@@ -222,6 +223,11 @@ def readings(name: str, files: ImageFiles) -> str:
     """The photos that a name may refer to, as a part of a sentence, where they are several; else empty."""
     several = files.candidates(name)
     return f"it may be {several[0]} or {several[1]}; leave one of them out" if len(several) > 1 else ""
+
+
+def instead(files: ImageFiles) -> str:
+    """A photo that there is, as a part of a sentence."""
+    return "".join(f": a photo of it is {name!r}" for name in list(files.photos)[:1])
 
 
 def none_usable(unusable: Sequence[tuple[str, str]]) -> Refusal:

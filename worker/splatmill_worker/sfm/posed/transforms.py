@@ -29,7 +29,7 @@ from splatmill_worker.sfm.posed import parts, polycam
 from splatmill_worker.sfm.posed.camera_models import UnreadModel, check_pixels, is_fisheye, radians
 from splatmill_worker.sfm.posed.colmap_model import camera_and_lens, fit_to_file
 from splatmill_worker.sfm.posed.encodings import NamesUnclear, chosen
-from splatmill_worker.sfm.posed.files import ImageFiles, missing, none_usable, readings
+from splatmill_worker.sfm.posed.files import ImageFiles, instead, missing, none_usable, readings
 from splatmill_worker.sfm.posed.model_files import MAX_DISTANCE, MAX_PARAMETER, MAX_SIDE, MOST_FAULTY
 from splatmill_worker.sfm.posed.one_camera import one_for_each
 from splatmill_worker.sfm.posed.parts import Part
@@ -138,7 +138,11 @@ def load(
         several = readings(left_out[0][0], files) if left_out else ""
         raise ValueError(
             f"{listed([path.name for path in paths])} has {len(left_out)} cameras{first}, and the capture has "
-            + (f"several photos of this name: {several}." if several else "none of their photos.")
+            + (
+                f"several photos of this name: {several}."
+                if several
+                else f"none of their photos{instead(files)}."
+            )
             + " Give the photos the names in file_path."
         )
     used = {view.image for view in views}
