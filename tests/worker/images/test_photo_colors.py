@@ -397,11 +397,24 @@ def test_a_fine_ramp_of_sixteen_bits_is_neither_banded_nor_clipped(suffix: str, 
         assert len(np.unique(values[8])) == 256
 
 
-@pytest.mark.parametrize("suffix", ["png", "tif"])
-def test_grey_of_sixteen_bits_is_rounded_to_the_nearest_level(suffix: str, tmp_path: Path) -> None:
-    deep = np.arange(65536, dtype=np.uint16).reshape(128, 512)
-    Image.fromarray(deep).save(tmp_path / f"g.{suffix}")
-    values = np.asarray(decode.decode(tmp_path / f"g.{suffix}"), np.float64)
+@pytest.mark.parametrize("layout", ["gray16", "rgb48", "rgba64"])
+@pytest.mark.parametrize("suffix", ["png", "raw.tif", "lzw.tif"])
+def test_sixteen_bits_are_rounded_to_the_nearest_level(suffix: str, layout: str, tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    deep = rng.permuted(np.tile(np.arange(65536, dtype=np.uint16), (4, 1)), axis=1).reshape(4, 128, 512)
+    deep = np.ascontiguousarray(
+        np.moveaxis(deep, 0, 2)[..., : {"gray16": 1, "rgb48": 3, "rgba64": 4}[layout]]
+    )
+    options = {"compression_algo": suffix.split(".")[0]} if suffix != "png" else {}
+    encoder: Any = av.CodecContext.create("png" if suffix == "png" else "tiff", "w")
+    encoder.width, encoder.height, encoder.options = 512, 128, options
+    encoder.pix_fmt, encoder.time_base = layout + ("be" if suffix == "png" else "le"), Fraction(1, 1)
+    frame = av.VideoFrame.from_ndarray(deep[..., 0] if deep.shape[2] == 1 else deep, format=f"{layout}le")
+    path = tmp_path / f"a.{suffix}"
+    path.write_bytes(
+        b"".join(bytes(packet) for packet in encoder.encode(frame.reformat(format=encoder.pix_fmt)))
+    )
+    values = np.asarray(decode.decode(path), np.float64).reshape(deep.shape)
     assert np.abs(values - deep / 257.0).max() <= 0.5
 
 

@@ -34,6 +34,13 @@ TURNED = (5, 6, 7, 8)
 MAX_REDUCTION = 64
 """Largest factor by which a decoded photo is reduced."""
 
+OTHER_BYTE = {
+    f"{mode};16{order}": f"{mode};16{'L' if order == 'B' else 'B'}"
+    for mode in ("RGB", "RGBA")
+    for order in "BLN"
+}
+"""Pillow's layouts of colours of 16 bits, of which it keeps the high byte (N: as this machine has it, which is L), and
+those by which it keeps the low one instead."""
 
 LARGEST_WHITE = 2.0
 """Largest of the floating-point numbers of a photo that count as going from 0 to 1: a little above is light beyond
@@ -154,8 +161,37 @@ def whole(image: Image.Image, name: str) -> Image.Image:
     Raises UnusablePicture, about the file `name`, when it does not decode.
     """
     with guarded.damage(name):
+        low = _low_bytes(image)
         image.load()
-        return _plain_mode(image)
+        return _plain_mode(image) if low is None else _rounded(image, low)
+
+
+def _low_bytes(image: Image.Image) -> Image.Image | None:
+    """The low bytes of an opened file with colours of 16 bits, as a picture; None for others.
+
+    Pillow has no colours of 16 bits, so the file is decoded once more.
+    """
+    path, tiles = getattr(image, "filename", ""), getattr(image, "tile", [])
+    layouts = {tile.args if isinstance(tile.args, str) else (tile.args or ("",))[0] for tile in tiles}
+    if not path or len(layouts) != 1 or (layout := OTHER_BYTE.get(layouts.pop())) is None:
+        return None
+    with guarded.opened(Path(path)) as low:
+        low.tile = [
+            tile._replace(args=layout if isinstance(tile.args, str) else (layout, *tile.args[1:]))
+            for tile in low.tile
+        ]
+        low.load()
+        return low.copy()
+
+
+def _rounded(high: Image.Image, low: Image.Image) -> Image.Image:
+    """The picture whose 16-bit values have these high and low bytes, with 8 bits, to the nearest level."""
+    level = np.asarray(high)
+    # A level of 8 bits is one of 257, so that its two bytes are equal.
+    above = np.asarray(low).astype(np.int16) - level
+    return Image.fromarray(
+        level + (above > 128).astype(np.uint8) - (above < -128).astype(np.uint8), high.mode
+    )
 
 
 def check_numbers(image: Image.Image, name: str) -> None:
