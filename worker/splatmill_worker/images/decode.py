@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from PIL import Image
+from PIL import Image, ImageFile
 
 from splatmill_worker.errors import UnusablePicture
 from splatmill_worker.images import guarded, transparency
@@ -171,13 +172,16 @@ def _low_bytes(image: Image.Image) -> Image.Image | None:
 
     Pillow has no colours of 16 bits, so the file is decoded once more.
     """
-    path, tiles = getattr(image, "filename", ""), getattr(image, "tile", [])
+    if not isinstance(image, ImageFile.ImageFile):
+        return None
+    path, tiles = image.filename, image.tile
     layouts = {tile.args if isinstance(tile.args, str) else (tile.args or ("",))[0] for tile in tiles}
     if not path or len(layouts) != 1 or (layout := OTHER_BYTE.get(layouts.pop())) is None:
         return None
-    with guarded.opened(Path(path)) as low:
+    with guarded.opened(Path(os.fsdecode(path))) as low:
+        assert isinstance(low, ImageFile.ImageFile)
         low.tile = [
-            tile._replace(args=layout if isinstance(tile.args, str) else (layout, *tile.args[1:]))
+            tile._replace(args=layout if isinstance(tile.args, str) else (layout, *(tile.args or ())[1:]))
             for tile in low.tile
         ]
         low.load()
