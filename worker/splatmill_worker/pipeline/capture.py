@@ -13,6 +13,7 @@ from splatmill_worker.errors import Refusal
 from splatmill_worker.images import overlays
 from splatmill_worker.images.masks import mask_folder
 from splatmill_worker.images.prepare import names_remark
+from splatmill_worker.pipeline import one_place
 from splatmill_worker.scene import Scene
 from splatmill_worker.sfm import posed
 from splatmill_worker.sfm.placed import PlacingObserver
@@ -75,9 +76,10 @@ def posed_scene(
                 ),
                 advice="Correct the poses, or remove them to have the cameras recovered from the photos.",
             ) from error
-        return posed.with_points(
+        scene = posed.with_points(
             scene, workdir, seed=options.seed, on_progress=on_progress, cancelled=cancelled
         )
+        return replace(scene, warnings=(*scene.warnings, *one_place.warning(scene)))
     images = capture / "images"
     wanted = sfm.SfmOptions(
         effort=options.sfm_effort.value,
@@ -96,4 +98,4 @@ def posed_scene(
         observer,
         None if options.scale is None else known_distance(options.scale),
     )
-    return replace(scene, warnings=(*names_remark(capture), *scene.warnings))
+    return replace(scene, warnings=(*names_remark(capture), *scene.warnings, *one_place.warning(scene)))
