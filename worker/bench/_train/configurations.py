@@ -71,6 +71,10 @@ CONFIGURATIONS = {
     "no-dropout": Configuration(
         "all Gaussians in every step, however often photos come", plan={"schedule.dropout": 0.0}
     ),
+    "not-watched": Configuration(
+        "all photos from the first step, to the end of the budget",
+        plan={"validation": None, "stops_when_flat": False},
+    ),
     "long-average": Configuration(
         "squared gradients averaged over a thousand steps", plan={"schedule.annealing.beta2": 0.999}
     ),

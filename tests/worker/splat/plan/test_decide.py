@@ -197,26 +197,43 @@ def test_a_given_model_keeps_its_degree_unless_another_is_asked_for() -> None:
     assert planned(narrow, sh_degree=0).schedule.degree == 0
 
 
-def test_only_a_run_without_budget_stops_when_its_curve_is_flat() -> None:
+def test_a_run_without_budget_stops_when_its_curve_is_flat() -> None:
     assert planned().stops_when_flat
-    assert not planned(steps=600).stops_when_flat
-    assert not planned(time_budget=10).stops_when_flat
+    assert planned().least_gain == 0.2
+    assert not planned(time_budget=10, target_psnr=30).stops_when_flat
 
 
 def test_photos_are_set_aside_where_a_decision_reads_them() -> None:
     assert planned().validation == 3
     assert planned(changed(views=500)).validation == 8
     assert planned(time_budget=10, target_psnr=30).validation == 3
-    for plan in (planned(steps=600), planned(time_budget=10)):
+
+
+def test_a_budget_of_many_visits_is_watched_for_over_fitting() -> None:
+    for plan in (planned(steps=600), planned(steps=4299), planned(time_budget=2)):
         assert plan.validation is None
-        assert plan.left_out["validation"].startswith("The budget alone ends the training")
+        assert not plan.stops_when_flat
+        assert "over-fitting is watched for from 100 times on" in plan.left_out["validation"]
+    long = planned(steps=4300)
+    assert (long.validation, long.stops_when_flat, long.least_gain) == (3, True, 0.0)
+    assert long.reasons["validation"] == (
+        "3 of 43 training photos are set aside until the last decision: about 4300 steps show each of 43 photos 100 "
+        "times; where that no longer raises their mean PSNR, the training goes back to its best and ends."
+    )
+    assert planned(time_budget=600).stops_when_flat
 
 
-def test_few_photos_are_all_trained_on_unless_a_target_needs_one() -> None:
-    few = planned(changed(views=11))
-    assert few.validation is None
-    assert not few.stops_when_flat
-    assert few.left_out["validation"].startswith("11 photos are too few to set one aside")
+def test_few_photos_spare_one_for_many_visits_and_are_all_trained_on_otherwise() -> None:
+    few = planned(changed(views=6))
+    assert (few.validation, few.stops_when_flat, few.least_gain) == (1, True, 0.0)
+    assert planned(changed(views=11), steps=4400).validation == 1
+    for many in (planned(changed(views=11), steps=4399), planned(changed(views=11))):
+        assert many.validation is None
+        assert "over-fitting is watched for from 400 times on" in many.left_out["validation"]
+    fewer = planned(changed(views=5))
+    assert fewer.validation is None
+    assert not fewer.stops_when_flat
+    assert fewer.left_out["validation"].startswith("5 photos are too few to set one aside")
     assert planned(changed(views=11), target_psnr=30).validation == 1
     assert planned(changed(views=2), target_psnr=30).validation == 1
     with pytest.raises(ValueError, match="the only photo is needed for training"):

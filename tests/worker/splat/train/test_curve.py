@@ -5,7 +5,8 @@ Does not prove that stopping there saves time on real photos.
 
 from __future__ import annotations
 
-from splatmill_worker.splat.train.curve import CurvePoint, last_gain
+from splatmill_worker.splat.train.curve import CurvePoint, validated
+from splatmill_worker.splat.train.curve import last_gain as gain_of
 
 
 def curve(*scores: float | None, every: int = 100) -> list[CurvePoint]:
@@ -24,6 +25,10 @@ def curve(*scores: float | None, every: int = 100) -> list[CurvePoint]:
     ]
 
 
+def last_gain(points: list[CurvePoint], since: int = 0) -> float | None:
+    return gain_of(validated(points, since))
+
+
 def test_the_best_of_the_second_half_is_compared_with_the_best_before() -> None:
     assert last_gain(curve(20.0, 24.0, 26.0, 27.0, 27.5, 27.25)) == 1.5
     assert last_gain(curve(20.0, 28.0, 27.0, 27.0, 27.5, 27.25)) == -0.5
@@ -31,6 +36,13 @@ def test_the_best_of_the_second_half_is_compared_with_the_best_before() -> None:
 
 def test_points_on_all_photos_say_nothing_and_do_not_count() -> None:
     assert last_gain(curve(20.0, 24.0, 26.0, 27.0, 27.5, 27.25, None)) == 1.5
+
+
+def test_points_on_reduced_photos_are_not_compared() -> None:
+    points = curve(29.0, 24.0, 26.0, 27.0, 27.5, 27.25)
+    assert last_gain(points) == -1.5
+    assert last_gain(points, since=100) == 1.5
+    assert last_gain(points, since=300) is None
 
 
 def test_too_few_points_or_steps_or_no_validation_views_are_no_evidence() -> None:

@@ -24,7 +24,7 @@ from tests.support.training import first_engine, plan, split
 
 FILE_KEYS = {
     "format", "parameters", "exp_avg", "exp_avg_sq", "step", "seconds", "rows", "recoveries", "rate_scale", "order",
-    "random", "views", "poses", "budget", "shortened", "most", "ever_saw",
+    "random", "views", "poses", "budget", "shortened", "most", "ever_saw", "best",
 }  # fmt: skip
 
 
@@ -135,7 +135,7 @@ def test_a_checkpoint_of_the_code_before_snapshots_is_resumed(tmp_path: Path) ->
 
 
 @pytest.mark.slow
-def test_the_file_has_the_keys_and_the_format_of_before(tmp_path: Path) -> None:
+def test_the_file_has_the_keys_of_its_format(tmp_path: Path) -> None:
     checkpoint.save(tmp_path, advanced(a_run(course()), 3).snapshot())
     stored = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
     assert set(stored) == FILE_KEYS

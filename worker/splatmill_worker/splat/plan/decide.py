@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from splatmill.schema import PRESET_GAIN, Background, TrainOptions
+from splatmill.schema import Background, TrainOptions
 from splatmill_worker.kernels.records import BETA2
 from splatmill_worker.splat.plan.capacity import decide_capacity, decide_densification
 from splatmill_worker.splat.plan.facts import Facts
@@ -15,6 +15,7 @@ from splatmill_worker.splat.plan.photos import (
     decide_exposure,
     decide_image_size,
     decide_validation,
+    least_gain,
     undistortion,
 )
 from splatmill_worker.splat.plan.plan import Kernels, Plan
@@ -64,13 +65,13 @@ def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
         "dropout": (dropout := _dropout(facts, steps)),
         "undistortion": undistortion(facts),
         "masks": Decision(facts.masked > 0, "" if facts.masked else "No photo has masked pixels."),
-        "validation": (validation := decide_validation(facts, options)),
+        "validation": (validation := decide_validation(facts, options, steps)),
         "background": (background := decide_background(facts, options)),
         "alpha": _alpha(facts, options),
         "exposure": (exposure := decide_exposure(facts, options)),
         "antialias": (antialias := decide_antialias(facts, options)),
     }
-    explanation = Explanation.of(decisions)
+    explanation, gain = Explanation.of(decisions), least_gain(facts, options)
     shell = None if facts.coverage is None else facts.coverage.shell_distance
     return Plan(
         schedule=Schedule(
@@ -97,15 +98,13 @@ def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
         antialias=antialias.value,
         target_psnr=options.target_psnr,
         max_memory=options.max_memory,
-        stops_when_flat=validation.value is not None
-        and options.steps is None
-        and options.time_budget is None,
+        stops_when_flat=validation.value is not None and gain is not None,
         seed=options.seed,
         far_shell=needs.far_shell.value,
         gaps=needs.gaps.value,
         pose_refinement=needs.pose_refinement.value,
         validation=validation.value,
-        least_gain=PRESET_GAIN[options.ending],
+        least_gain=gain or 0.0,
         reasons=explanation.chosen,
         left_out=explanation.left_out,
         forced=explanation.forced,

@@ -9,6 +9,7 @@ from splatmill_worker.splat.plan.facts import Facts
 from splatmill_worker.splat.plan.needs import FEW_VIEWS
 from splatmill_worker.splat.plan.plan import Kernels
 from splatmill_worker.splat.plan.reasons import Decision, by_option, switch
+from splatmill_worker.splat.plan.schedule import MANY_VISITS
 
 PRESET_SIZE: dict[Kernels, dict[Preset, int]] = {
     "reference": {Preset.draft: 64, Preset.balanced: 64, Preset.quality: 128},
@@ -35,8 +36,14 @@ CERTAIN = 3.0
 """Standard errors of an exposure that a departure exceeds at least, to be one."""
 
 PHOTOS_PER_VALIDATION = 12
-"""Training photos for each one that is set aside: fewer than are held out, since training misses them, and none where
-training can spare none (FEW_VIEWS)."""
+"""Training photos for each one that is set aside: fewer than are held out, since training misses them."""
+
+FEWEST_WATCHED = 6
+"""Training photos from which one is set aside where over-fitting is to be expected."""
+
+FEW_WATCHED_VISITS = 400
+"""Steps on each photo from which over-fitting is watched for where fewer photos than PHOTOS_PER_VALIDATION have to
+spare one; with more photos, from MANY_VISITS on (decisions: best-validated)."""
 
 MOST_VALIDATION = 8
 """Photos that are set aside at most: they are measured whole at every point of the curve."""
@@ -162,13 +169,27 @@ def _antialias(facts: Facts) -> Decision[bool]:
     )
 
 
-def decide_validation(facts: Facts, options: TrainOptions) -> Decision[int | None]:
+def least_gain(facts: Facts, options: TrainOptions) -> float | None:
+    """Gain of a doubling of the steps on the validation photos, dB, below which training ends.
+
+    That of the preset where no budget is given; 0 where training ends only once it over-fits; None where a target alone
+    ends it before its budget.
+    """
+    by_preset = options.steps is None and options.time_budget is None
+    if by_preset and (options.target_psnr is not None or facts.views >= PHOTOS_PER_VALIDATION):
+        return PRESET_GAIN[options.ending]
+    return 0.0 if options.target_psnr is None else None
+
+
+def decide_validation(facts: Facts, options: TrainOptions, steps: int) -> Decision[int | None]:
     """Number of training photos that are set aside for decisions made while training; None where none is needed.
 
     Held-out photos are for the report alone: a run that stopped by them would be judged by photos that it was chosen
     by. Raises ValueError where a target is asked for and no photo can be spared.
+
+    steps: number of steps that the budget is expected to allow.
     """
-    count = min(MOST_VALIDATION, facts.views // PHOTOS_PER_VALIDATION)
+    count, gain = min(MOST_VALIDATION, facts.views // PHOTOS_PER_VALIDATION), least_gain(facts, options)
     if options.target_psnr is not None:
         if facts.views < 2:
             raise ValueError(
@@ -177,22 +198,28 @@ def decide_validation(facts: Facts, options: TrainOptions) -> Decision[int | Non
             )
         count = max(1, count)
         what = f"the training ends when their mean PSNR reaches {options.target_psnr:g} dB"
-    elif options.steps is not None or options.time_budget is not None:
-        return Decision(
-            None,
-            f"The budget alone ends the training, so that no decision needs any of the {facts.views} photos.",
+    elif gain:
+        what = (
+            "the training ends when the last doubling of the steps has raised their mean PSNR by less than "
+            f"{gain:g} dB"
         )
-    elif count == 0:
+    elif facts.views < FEWEST_WATCHED:
         return Decision(
             None,
-            f"{facts.views} photos are too few to set one aside, which is done from {PHOTOS_PER_VALIDATION} photos on, "
-            "so the training does not end before its budget.",
+            f"{facts.views} photos are too few to set one aside, which is done from {FEWEST_WATCHED} photos on, so the "
+            "training does not end before its budget.",
         )
     else:
-        what = (
-            f"the training ends when the last doubling of the steps has raised their mean PSNR by less than "
-            f"{PRESET_GAIN[options.ending]:g} dB"
-        )
+        visits, watched = steps / facts.views, MANY_VISITS if count else FEW_WATCHED_VISITS
+        shown = f"bout {steps} steps show each of {facts.views} photos {visits:.0f} times"
+        if visits < watched:
+            return Decision(
+                None,
+                f"A{shown}, and over-fitting is watched for from {watched} times on: the budget alone ends the "
+                "training.",
+            )
+        count = max(1, count)
+        what = f"a{shown}; where that no longer raises their mean PSNR, the training goes back to its best and ends"
     return Decision(
         count, f"{count} of {facts.views} training photos are set aside until the last decision: {what}."
     )

@@ -11,9 +11,9 @@ from splatmill_worker.splat.plan.schedule import Schedule
 
 Kernels = Literal["reference", "cpu", "gpu"]
 
-BYTES_PER_GAUSSIAN = 59 * 4 * 8
-"""Memory of one Gaussian in training: 59 parameters of 4 bytes, times eight. That is parameters and two moments, twice
-while they are rewritten, the snapshot, and room for the kernels' records."""
+BYTES_PER_GAUSSIAN = 59 * 4 * 11
+"""Memory of one Gaussian in training: 59 parameters of 4 bytes, times eleven. That is parameters and two moments, twice
+while they are rewritten, the last good and the best snapshot, and room for the kernels' records."""
 
 BYTES_OF_PROGRAM = 350 * 10**6
 """Memory that is assumed for the program and the photos."""
@@ -34,14 +34,14 @@ class Plan:
     antialias: opacities are compensated for the 0.3 pixels by which projection widens every Gaussian.
     target_psnr: PSNR of the validation photos at which training ends, dB; None: none.
     max_memory: limit of the memory in use, bytes; None: none.
-    stops_when_flat: training ends early once the last doubling of the steps has gained less than `least_gain`.
+    stops_when_flat: training ends early, from its best scene, once the last doubling of the steps has gained less than
+        `least_gain` on the validation photos.
     seed: of all random numbers.
     far_shell: Gaussians stand behind the scene, wherever photos look.
     gaps: Gaussians are added where photos show something that no point describes.
     pose_refinement: the cameras of training photos are corrected.
-    validation: number of training photos that are set aside for `target_psnr` and `stops_when_flat`; None: neither is
-        asked for.
-    least_gain: dB on the validation photos, for `stops_when_flat`.
+    validation: number of training photos that are set aside for `target_psnr` and `stops_when_flat`; None: neither.
+    least_gain: dB, for `stops_when_flat`; 0 where training ends only once it over-fits.
     reasons: a sentence for each field of the plan.
     left_out: a sentence for each thing that this scene does not need.
     forced: names of what an option fixed.

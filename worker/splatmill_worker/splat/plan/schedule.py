@@ -10,6 +10,10 @@ from splatmill_worker.splat.plan.rates import Annealing
 MANY_VISITS = 100
 """Steps on each photo after which training begins to learn the photos by heart (decisions: dropout)."""
 
+SETTLING = 0.5
+"""Share of the steps between two densifications in which training restores the opacities that the first one decayed
+(decisions: SETTLING)."""
+
 
 @dataclass(frozen=True)
 class Schedule:
@@ -43,6 +47,11 @@ class Schedule:
     annealing: Annealing = field(default_factory=Annealing)
     dropout: float = 0.0
 
+    @property
+    def reduced_until(self) -> int:
+        """The last step on reduced photos."""
+        return self.resolution[-1][0]
+
     def reduction(self, step: int) -> int:
         """The factor by which photos are reduced at `step` (1-based)."""
         return [factor for first, factor in self.resolution if first < step][-1]
@@ -53,6 +62,15 @@ class Schedule:
         It grows from 0 at MANY_VISITS to `dropout` at twice as many.
         """
         return self.dropout * min(1.0, max(0.0, visits / MANY_VISITS - 1.0))
+
+    def unsettled(self, step: int, progress: float) -> bool:
+        """Whether a densification was at most SETTLING of the way to the next one ago: opacities are still decayed."""
+        since = (step - self.densify_from) % self.densify_every
+        return (
+            step >= self.densify_from
+            and progress < self.densify_until
+            and since < SETTLING * self.densify_every
+        )
 
     def densifies(self, step: int, progress: float) -> bool:
         """Whether Gaussians may be added after `step`, at which the share `progress` of the budget is spent."""

@@ -87,6 +87,7 @@ def _encoded(snapshot: Snapshot) -> dict[str, Any]:
         **{name: getattr(snapshot, name) for name in TENSORS},
         "seconds": snapshot.seconds,
         "views": list(snapshot.view_names),
+        "best": None if snapshot.best is None else _encoded(snapshot.best),
         **{NAMES.get(name, name): list(v) if isinstance(v, tuple) else v for name, v in state.items()},
     }
 
@@ -101,4 +102,5 @@ def _decoded(state: dict[str, Any]) -> Snapshot:
         state=RunState(**values),
         seconds=state["seconds"],
         view_names=tuple(state["views"]),
+        best=_decoded(state["best"]) if state.get("best") else None,
     )

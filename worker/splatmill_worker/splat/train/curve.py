@@ -43,9 +43,20 @@ class CurvePoint:
     validation_psnr: float | None = None
 
 
-def last_gain(curve: Sequence[CurvePoint]) -> float | None:
-    """dB that the best validation PSNR has gained since half of the steps; None where that is not known yet."""
-    scores = [(point.step, point.validation_psnr) for point in curve if point.validation_psnr is not None]
+def validated(curve: Sequence[CurvePoint], since: int = 0) -> list[tuple[int, float]]:
+    """Step and validation PSNR, dB, of the points after step `since` that have one.
+
+    since: last step on reduced photos, where scenes are to be compared: they fit photos of one size.
+    """
+    return [
+        (point.step, point.validation_psnr)
+        for point in curve
+        if point.validation_psnr is not None and point.step > since
+    ]
+
+
+def last_gain(scores: Sequence[tuple[int, float]]) -> float | None:
+    """dB that the best of `validated` scores has gained since half of the steps; None where that is not known yet."""
     if not scores or scores[-1][0] < GAIN_FROM:
         return None
     half = scores[-1][0] / 2

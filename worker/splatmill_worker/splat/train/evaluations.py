@@ -109,22 +109,31 @@ class Evaluations:
         self.seconds = 0.0
         self.final: FinalScores | None = None
         # A resumed run is evaluated at the end again: an attempt may die after its last step and before its export.
-        passed = sum(share <= run.progress for share in self._chosen.shares)
+        last = run.state.curve[-1] if run.state.curve else None
+        reached = 0.0 if last is None else run.state.budget.progress(last.step, last.seconds)
+        passed = sum(share <= reached for share in self._chosen.shares)
         self._next = min(passed, len(self._chosen.shares) - 1)
 
     def is_due(self, run: TrainingRun) -> bool:
-        """Whether the next share of the budget is reached."""
-        return run.progress >= self._chosen.shares[self._next]
+        """Whether the next share of the budget is reached, and opacities have recovered from a densification."""
+        reached = run.progress >= self._chosen.shares[self._next]
+        return reached and not (
+            run.plan.densify and run.plan.schedule.unsettled(run.state.step, run.progress)
+        )
 
     def observe(self, run: TrainingRun) -> None:
         """Evaluate, and decide whether the run ends."""
         self._evaluated(self.evaluate(), run.engine)
+        run.keep_best()
         run.stopped = reason_to_stop(run)
 
     @property
-    def last_is_next(self) -> bool:
-        """Whether the only evaluation to come is that at the end of the budget."""
-        return self._next >= len(self._chosen.shares) - 1
+    def decided(self) -> bool:
+        """Whether no evaluation to come is one that decides: that at the end does not, and a gain is none while rates
+        fall."""
+        plan, shares = self._run.plan, self._chosen.shares
+        last = self._next >= len(shares) - 1
+        return last or (plan.target_psnr is None and shares[self._next] > plan.schedule.annealing.hold)
 
     def evaluate(self) -> CurvePoint:
         """Evaluate now; the point is added to the curve of the run."""

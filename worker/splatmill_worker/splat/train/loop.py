@@ -124,7 +124,7 @@ def train(
         observers.append(Checkpoints(hooks.checkpoint, hooks.checkpoint_seconds))
     failure = None
     while not run.stopped:
-        if run.set_aside and (run.state.shortened or evaluations.last_is_next):
+        if run.set_aside and (run.state.shortened or evaluations.decided):
             run.train_on_all()
         if hooks.cancelled():
             if hooks.checkpoint is not None and run.state.step > 0:

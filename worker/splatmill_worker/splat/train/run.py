@@ -15,6 +15,7 @@ from splatmill_worker.splat.engine.protocol import Engine, StepResult
 from splatmill_worker.splat.plan.budget import Clock
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.plan.rates import RateSchedule, boost_of
+from splatmill_worker.splat.train.curve import validated
 from splatmill_worker.splat.train.density.densify import densify
 from splatmill_worker.splat.train.dropout import dropout
 from splatmill_worker.splat.train.health import LossHealth
@@ -53,6 +54,7 @@ class TrainingRun:
     pace: seconds per step.
     stopped: why the run has ended, a clause; empty while it goes on.
     last_good: the snapshot to roll back to; None before the first.
+    best: the scene that has shown the validation photos best; None before the first, and without any such photos.
     """
 
     def __init__(
@@ -76,6 +78,7 @@ class TrainingRun:
         self.pace = Pace(plan.schedule.expected_steps)
         self.stopped = ""
         self.last_good: Snapshot | None = None
+        self.best: Snapshot | None = None
         self._random = torch.Generator().manual_seed(plan.seed)
 
     @property
@@ -122,6 +125,24 @@ class TrainingRun:
             annealing = replace(annealing, boost=boost_of(steps))
         return RateSchedule(self.extent, annealing, self.state.rate_scale).at(progress)
 
+    @property
+    def validated(self) -> list[tuple[int, float]]:
+        """Step and validation PSNR, dB, of the points of the curve that decisions compare."""
+        return validated(self.state.curve, since=self.plan.schedule.reduced_until)
+
+    def keep_best(self) -> None:
+        """Keep the scene if it has just shown the validation photos better than any before."""
+        scores = self.validated
+        if scores and scores[-1] == (self.state.step, max(psnr for _, psnr in scores)):
+            self.best = self.snapshot().stored()
+
+    def go_back(self) -> None:
+        """Restore the best scene, where one was kept: what came after it is over-fitting."""
+        if self.best is not None:
+            self._restore(self.best)
+            self.last_good = self.best
+            self.health.expect_rise(self.state.step)
+
     def shorten(self, tail: float) -> None:
         """End after another `tail` of what was spent so far: rates fall to their ends in that time."""
         self.state.budget = self.state.budget.ending_at(self.progress, tail)
@@ -141,6 +162,7 @@ class TrainingRun:
         if failure.name is FailureName.memory:
             self.state.max_gaussians = max(1, int(MEMORY_SHRINK * self.engine.count))
             self.last_good = self.last_good.most_opaque(self.state.max_gaussians)
+            self.best = None
             measure = f"with at most {self.state.max_gaussians} Gaussians"
         else:
             self.state.rate_scale *= 0.5
@@ -171,12 +193,14 @@ class TrainingRun:
             random=self._random.get_state(),
             view_names=tuple(view.name for view in self.views),
             lowest_loss=self.health.lowest,
+            best=self.best,
         )
 
     def resume(self, snapshot: Snapshot) -> None:
         """Go on from `snapshot`. Densification scores, the pace and the health of the loss start anew."""
         self._restore(snapshot)
         self.state = replace(snapshot.state)
+        self.best = snapshot.best
         self.clock = Clock(snapshot.seconds)
         self._random.set_state(snapshot.random)
         self.health.expect_rise(self.state.step)

@@ -50,6 +50,7 @@ class Snapshot:
     seconds: training time, without evaluations and checkpoints.
     random: state of the random generator.
     view_names: names of the training views, to which the indices belong.
+    best: the scene that showed the validation photos best; None where none was kept.
     lowest_loss: lowest smoothed loss so far. Checkpoints do not store it: a resumed run watches its loss anew.
     """
 
@@ -62,11 +63,22 @@ class Snapshot:
     random: Tensor
     view_names: tuple[str, ...]
     lowest_loss: float = math.inf
+    best: Snapshot | None = None
 
     @property
     def progress(self) -> float:
         """Share of the budget that was spent, 0 to 1."""
         return self.state.budget.progress(self.state.step, self.seconds)
+
+    def stored(self) -> Snapshot:
+        """The same on the CPU, with no best scene of its own."""
+        return replace(
+            self,
+            parameters={name: value.cpu() for name, value in self.parameters.items()},
+            exp_avg=self.exp_avg.cpu(),
+            exp_avg_sq=self.exp_avg_sq.cpu(),
+            best=None,
+        )
 
     def most_opaque(self, limit: int) -> Snapshot:
         """The same with the `limit` most opaque Gaussians alone, in their order."""
