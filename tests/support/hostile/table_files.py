@@ -78,7 +78,7 @@ FILES = (
     _picture("a.jpg", "a JPEG that is a zip as well", photo() + packed({"../a": b"x"}), "used", "1 photo"),
     _picture("a.png", "1 x 1", encoded(Image.new("RGB", (1, 1)), "PNG"), LEFT_OUT, "too small"),
     _picture("a.png", "1 x 100,000", encoded(Image.new("L", (1, 100_000)), "PNG"), LEFT_OUT, "too small"),
-    _picture("a.png", "16 bits per channel", encoded(_GREY16, "PNG"), "used", "1 photo"),
+    _picture("a.png", "one channel of 16 bits", encoded(_GREY16, "PNG"), LEFT_OUT, "depth maps"),
     _picture("a.jpg", "CMYK", encoded(noise().convert("CMYK"), "JPEG"), "used", "1 photo"),
     _picture(
         "a.webp",

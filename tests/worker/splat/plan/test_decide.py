@@ -223,17 +223,11 @@ def test_a_budget_of_many_visits_is_watched_for_over_fitting() -> None:
     assert planned(time_budget=600).stops_when_flat
 
 
-def test_few_photos_spare_one_for_many_visits_and_are_all_trained_on_otherwise() -> None:
-    few = planned(changed(views=6))
-    assert (few.validation, few.stops_when_flat, few.least_gain) == (1, True, 0.0)
-    assert planned(changed(views=11), steps=4400).validation == 1
-    for many in (planned(changed(views=11), steps=4399), planned(changed(views=11))):
-        assert many.validation is None
-        assert "over-fitting is watched for from 400 times on" in many.left_out["validation"]
-    fewer = planned(changed(views=5))
-    assert fewer.validation is None
-    assert not fewer.stops_when_flat
-    assert fewer.left_out["validation"].startswith("5 photos are too few to set one aside")
+def test_few_photos_are_all_trained_on_unless_a_target_needs_one() -> None:
+    for few in (planned(changed(views=11)), planned(changed(views=11), steps=6000)):
+        assert few.validation is None
+        assert not few.stops_when_flat
+        assert few.left_out["validation"].startswith("11 photos are too few to set one aside")
     assert planned(changed(views=11), target_psnr=30).validation == 1
     assert planned(changed(views=2), target_psnr=30).validation == 1
     with pytest.raises(ValueError, match="the only photo is needed for training"):

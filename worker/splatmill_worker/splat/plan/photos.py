@@ -36,14 +36,8 @@ CERTAIN = 3.0
 """Standard errors of an exposure that a departure exceeds at least, to be one."""
 
 PHOTOS_PER_VALIDATION = 12
-"""Training photos for each one that is set aside: fewer than are held out, since training misses them."""
-
-FEWEST_WATCHED = 6
-"""Training photos from which one is set aside where over-fitting is to be expected."""
-
-FEW_WATCHED_VISITS = 400
-"""Steps on each photo from which over-fitting is watched for where fewer photos than PHOTOS_PER_VALIDATION have to
-spare one; with more photos, from MANY_VISITS on (decisions: best-validated)."""
+"""Training photos for each one that is set aside: fewer than are held out, since training misses them. From
+MANY_VISITS on they are set aside under a budget as well (decisions: best-validated)."""
 
 MOST_VALIDATION = 8
 """Photos that are set aside at most: they are measured whole at every point of the curve."""
@@ -203,22 +197,21 @@ def decide_validation(facts: Facts, options: TrainOptions, steps: int) -> Decisi
             "the training ends when the last doubling of the steps has raised their mean PSNR by less than "
             f"{gain:g} dB"
         )
-    elif facts.views < FEWEST_WATCHED:
+    elif count == 0:
         return Decision(
             None,
-            f"{facts.views} photos are too few to set one aside, which is done from {FEWEST_WATCHED} photos on, so the "
-            "training does not end before its budget.",
+            f"{facts.views} photos are too few to set one aside, which is done from {PHOTOS_PER_VALIDATION} photos on, "
+            "so the training does not end before its budget.",
         )
     else:
-        visits, watched = steps / facts.views, MANY_VISITS if count else FEW_WATCHED_VISITS
+        visits = steps / facts.views
         shown = f"bout {steps} steps show each of {facts.views} photos {visits:.0f} times"
-        if visits < watched:
+        if visits < MANY_VISITS:
             return Decision(
                 None,
-                f"A{shown}, and over-fitting is watched for from {watched} times on: the budget alone ends the "
+                f"A{shown}, and over-fitting is watched for from {MANY_VISITS} times on: the budget alone ends the "
                 "training.",
             )
-        count = max(1, count)
         what = f"a{shown}; where that no longer raises their mean PSNR, the training goes back to its best and ends"
     return Decision(
         count, f"{count} of {facts.views} training photos are set aside until the last decision: {what}."
