@@ -24,8 +24,8 @@ QUIET = 0.1
 
 _WORKER = Path(splatmill_worker.__file__).parent
 _COMPUTES = [
-    *(_WORKER / name for name in ("images", "kernels", "sfm", "splat", "synthetic")),
-    *(_WORKER / f"{name}.py" for name in ("capture", "colmap", "pipeline", "scene")),
+    *(_WORKER / name for name in ("images", "kernels", "pipeline", "readers", "sfm", "splat", "synthetic")),
+    *(_WORKER / f"{name}.py" for name in ("colmap", "scene")),
     Path(splatmill.schema.__file__).parent / "options.py",
 ]
 
