@@ -325,7 +325,7 @@ def test_a_storage_that_does_not_answer_leaves_jobs_to_be_listed_and_cancelled(
         assert s3.stalled >= SLOTS, "the requests above were answered while storage did not answer"
         refused = [look.result(20) for look in looks if look.done()]
         assert refused
-        assert "operations wait for it" in problem(refused[0], 503, "storage_unavailable")["detail"]
+        assert "operations as may wait for it" in problem(refused[0], 503, "storage_unavailable")["detail"]
         s3.fault = lambda _: None
         s3.release()
         answers = [look.result(20) for look in looks]

@@ -19,6 +19,7 @@ from splatmill_server.space.holdings import Holding, sums
 from splatmill_server.space.ledger import Ledger
 from tests.server.space.conftest import Clock, Person, ServePeople
 from tests.support.served_app import ServedApp, problem
+from tests.support.waiting import wait_for
 
 pytestmark = pytest.mark.slow  # a server for each case
 
@@ -36,6 +37,7 @@ def _model(app: ServedApp, job_id: str, owner: str, **more: str) -> int:
     storage = app.service.storage
     record = json.loads(storage.get(layout.job_record(job_id)))
     storage.put(layout.job_record(job_id), json.dumps(record | {"owner": owner} | more).encode())
+    wait_for(lambda: storage.exists(layout.job_log(job_id)))  # the end of a job has its log stored
     return sum(entry.size for entry in storage.entries(layout.model(job_id)))
 
 
@@ -53,13 +55,14 @@ def test_bytes_are_counted_by_owner_and_by_kind(people: ServedApp) -> None:
         for entry in storage.entries(layout.capture(mine))
         if "/files/" not in entry.path and "/sfm/" not in entry.path
     )
+    log = len(storage.get(layout.job_log(job_id)))
     expected = {
         "captures": 5200 + overhead,
         "sfm": 70,
-        "jobs": 30,
+        "jobs": 30 + log,
         "models": model,
         "uploads": 0,
-        "bytes": 5300 + overhead + model,
+        "bytes": 5300 + overhead + model + log,
     }
     assert ann.use() == {"ann": expected}
     assert chief.use()["ann"] == expected
@@ -96,6 +99,7 @@ def test_an_unfinished_job_is_named_by_what_it_needs(people: ServedApp) -> None:
         ("capture", first): None,
         ("capture", second): running,
         ("model", start): running,
+        ("job", start): None,
     }
 
 

@@ -14,13 +14,13 @@ import pytest
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.readers import colmap_files, point_file
 from splatmill_worker.sfm import posed
-from splatmill_worker.sfm.posed import model_files
+from splatmill_worker.sfm.posed import model_files, transforms
+from splatmill_worker.sfm.posed.files import ImageFiles
 from tests.support.hostile import model_bombs, models, pictures
 from tests.support.hostile.pictures import write
 from tests.support.reader_peak import peaks
 
 READ = "splatmill_worker.sfm.posed.model_files:read"
-TRANSFORMS = "splatmill_worker.sfm.posed.transforms"
 
 
 def text(folder: Path, **changes: str) -> Path:
@@ -65,7 +65,8 @@ def test_a_capture_with_a_model_without_points_has_cameras(tmp_path: Path) -> No
 LOAD = """
 import resource, sys
 from pathlib import Path
-from splatmill_worker.sfm.posed import model_files
+from splatmill_worker.sfm.posed import model_files, transforms
+from splatmill_worker.sfm.posed.files import ImageFiles
 used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
 resource.setrlimit(resource.RLIMIT_AS, (used + 2**28, used + 2**28))
 for folder in sys.argv[1:]:
@@ -105,12 +106,17 @@ def test_small_files_do_not_become_large(tmp_path: Path) -> None:
     assert all(size < 200 * 10**6 for size, _ in found.values()), found
 
 
+def parsed(path: Path) -> None:
+    """Parse a transforms.json of a capture without photos."""
+    transforms._parsed(path, ImageFiles(path.parent, {}, {}))
+
+
 @pytest.mark.slow
 @PEAKS_ONLY
 def test_points_and_transforms_that_would_fill_the_memory_are_refused(tmp_path: Path) -> None:
     write(tmp_path / "small.json", models.transforms())
     write(tmp_path / "nested.json", model_bombs.nested_json(10**7))
-    ((size, said),) = peaks(f"{TRANSFORMS}:_parsed", [tmp_path / "small.json", tmp_path / "nested.json"])
+    ((size, said),) = peaks(f"{__name__}:parsed", [tmp_path / "small.json", tmp_path / "nested.json"])
     assert "its lists and objects would take 1.3 GB" in said
     assert size < 100 * 10**6
     write(tmp_path / "small.ply", models.ply(3))
