@@ -52,7 +52,7 @@ class TrainingRun:
     reduction: factor by which the photos of the last step were reduced; 0 before the first.
     health: judges the loss.
     pace: seconds per step.
-    stopped: why the run has ended, a clause; empty while it goes on.
+    stopped: why the run has ended, a clause; empty while it runs.
     last_good: the snapshot to roll back to; None before the first.
     best: the scene that has shown the validation photos best; None before the first, and without any such photos.
     """
