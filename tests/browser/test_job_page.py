@@ -123,11 +123,9 @@ def seen(page: Page) -> np.ndarray:
     return np.asarray(picture.convert("RGB"), np.float64) / 255.0
 
 
-def test_a_whole_job_is_watched_from_its_beginning_to_its_model(
-    service: Up, capture: str, open_window: Open
-) -> None:
+def test_the_scene_is_watched_while_it_trains(service: Up, capture: str, open_window: Open) -> None:
     page = open_window(service, viewport={"width": 800, "height": 500}).page
-    job_id = submit(service, capture, time_budget="20s")
+    job_id = submit(service, capture, time_budget="10m")
     page.goto(f"/jobs/{job_id}")
     expect(page.get_by_role("heading", level=1)).to_have_text("watched")
     snapshots(page, 1)
@@ -144,6 +142,18 @@ def test_a_whole_job_is_watched_from_its_beginning_to_its_model(
     snapshots(page, shown + 1)
     assert box.get_attribute("data-pose") == turned
     assert seen(page).std() > 0.05
+    page.get_by_role("button", name="Cancel").click()
+    page.get_by_role("button", name="Cancel the job").click()
+    expect(page.locator("#state")).to_have_text("Cancelled", timeout=60_000)
+
+
+def test_a_whole_job_is_watched_from_its_beginning_to_its_model(
+    service: Up, capture: str, open_window: Open
+) -> None:
+    page = open_window(service, viewport={"width": 800, "height": 500}).page
+    job_id = submit(service, capture, time_budget="15s")
+    page.goto(f"/jobs/{job_id}")
+    snapshots(page, 1)
 
     expect(page.locator("#state")).to_have_text("Finished", timeout=60_000)
     link = page.get_by_role("link", name="Open the model")

@@ -79,7 +79,8 @@ class Up:
         assert self.process is not None
         family = [self.process.pid, *(child.pid for child in self.tree())]
         for pid in family if children else family[:1]:
-            os.kill(pid, signal.SIGKILL)
+            with contextlib.suppress(ProcessLookupError):  # some live for a moment only
+                os.kill(pid, signal.SIGKILL)
         self.process.wait(60)
         assert self.process.stdin is not None
         assert self.process.stdout is not None
