@@ -14,13 +14,14 @@ import redis
 from splatmill.backplane import keys
 from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.storage import Storage
-from splatmill.schema import PHOTO_SUFFIXES, CreateJob, Job, Role, StoredKind, TrainOptions
+from splatmill.schema import PHOTO_SUFFIXES, BinKind, CreateJob, Job, Role, StoredKind, TrainOptions
 from splatmill.schema.files.formats import is_model_file
 from splatmill_server.access.caller import Caller
 from splatmill_server.base.problems import ProblemError
 from splatmill_server.captures.records import Captures
 from splatmill_server.jobs.records import Jobs, job_not_found
 from splatmill_server.models import Models
+from splatmill_server.space.bin import Bin
 from splatmill_server.space.deletion import DELETED, DELETING
 from splatmill_server.space.holdings import Holding
 from splatmill_server.space.quota import Quota
@@ -30,13 +31,20 @@ class Admission:
     """Makes the jobs that may be made. Methods raise ProblemError, StorageError and redis.RedisError."""
 
     def __init__(
-        self, storage: Storage, captures: Captures, jobs: Jobs, models: Models, quota: Quota
+        self,
+        storage: Storage,
+        captures: Captures,
+        jobs: Jobs,
+        models: Models,
+        quota: Quota,
+        records_bin: Bin,
     ) -> None:
         self.storage = storage
         self.captures = captures
         self.jobs = jobs
         self.models = models
         self.quota = quota
+        self.bin = records_bin
 
     def create(
         self, who: Caller, request: CreateJob, *, key: str | None = None, body: str = ""
@@ -65,6 +73,8 @@ class Admission:
             )
             if new and keep_room is not None:
                 keep_room(job.id)
+        if new:
+            self._take_out_of_bin(request.capture, request.options)
         return job, new
 
     def restart(self, who: Caller, job_id: str) -> Job:
@@ -94,7 +104,15 @@ class Admission:
 
             restarted = self.jobs.restart(job_id, check=check, watched=[*mark_keys(needs), own_mark])
             keep_room(job_id)
+        self.bin.take_out(BinKind.job, job_id)
+        self._take_out_of_bin(row.capture, row.options)
         return restarted
+
+    def _take_out_of_bin(self, capture_id: str, options: TrainOptions) -> None:
+        """Take out of the bin what a job uses that was just made."""
+        self.bin.take_out(BinKind.capture, capture_id)
+        if options.start_model is not None:
+            self.bin.take_out(BinKind.job, options.start_model)
 
     def _check_trainable(self, capture_id: str) -> None:
         """Raise a 404 or 422 problem for a capture that certainly cannot be trained: it has no photos, or only one."""

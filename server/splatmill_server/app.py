@@ -22,6 +22,7 @@ from splatmill_server.base import problems, root_path
 from splatmill_server.base.proxies import TrustedProxies
 from splatmill_server.base.settings import Settings
 from splatmill_server.middleware import RequestMiddleware
+from splatmill_server.routes import bin as bin_routes
 from splatmill_server.routes import (
     captures,
     edits,
@@ -131,6 +132,7 @@ def _routes() -> Sequence[BaseRoute]:
         models,
         orbits,
         shares,
+        bin_routes,
         webhooks,
         key_routes,
         session,

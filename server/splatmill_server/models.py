@@ -17,6 +17,7 @@ from splatmill.backplane.storage.records import UnreadableRecord, warn
 from splatmill.backplane.storage.storage import Entry, Storage
 from splatmill.schema import (
     DEFAULT_OWNER,
+    BinKind,
     Job,
     JobState,
     Model,
@@ -32,7 +33,7 @@ from splatmill_server.base.filters import Filter
 from splatmill_server.base.lists import Ended, Lists, each
 from splatmill_server.base.problems import ProblemError
 from splatmill_server.base.root_path import address
-from splatmill_server.jobs.records import Jobs, read_record
+from splatmill_server.jobs.records import Jobs, read_model_record, read_record
 
 _HEADER_BYTES = 8192
 _VERTICES = re.compile(rb"^element vertex (\d+)\s*$", re.MULTILINE)
@@ -102,6 +103,13 @@ class Models:
         except (FileNotFoundError, UnreadableRecord):
             return self.jobs.get_owner(model_id)
 
+    def get_name(self, model_id: str) -> str | None:
+        """Return the name of a model, or None if it has none that can be read."""
+        try:
+            return read_record(self.storage, model_id).name
+        except (FileNotFoundError, UnreadableRecord):
+            return None
+
     def get(self, model_id: str) -> Model:
         """Return a model with its files. Raises 404 and 409 problems, and 500 if its files cannot be read."""
         self.check(model_id)
@@ -110,8 +118,8 @@ class Models:
             entry.path.removeprefix(folder): entry for entry in self.storage.entries(layout.model(model_id))
         }
         try:
-            job = read_record(self.storage, model_id)
-            digests = self._digests(model_id)
+            job, record = read_model_record(self.storage, model_id)
+            digests = _digests(record)
             gaussians, degree = self._header(model_id, files["model.ply"])
         except (KeyError, ValueError, FileNotFoundError) as error:
             raise ProblemError(
@@ -144,6 +152,12 @@ class Models:
             links=_links(model_id),
         )
 
+    def rename(self, model_id: str, name: str | None) -> Model:
+        """Name a model, and its job with it. Raises 404 and 409 problems."""
+        self.check(model_id)
+        self.jobs.rename(model_id, name)
+        return self.get(model_id)
+
     def list(self, cursor: str | None, limit: int, only: Filter | None = None) -> ModelPage:
         """Return a page of the models that `only` admits, the newest first. Raises the problems of `Lists.page`."""
         only = only or Filter()
@@ -155,6 +169,8 @@ class Models:
 
     def _listed(self, model_ids: Sequence[str], only: Filter) -> dict[str, Model]:
         """Return those of these models that `only` admits, by id. What was read of one is kept for lists."""
+        binned = self.lists.binned(BinKind.job, model_ids)
+        model_ids = [model_id for model_id in model_ids if model_id not in binned]
         known = {name: _kept(kept) for name, kept in self.lists.records("models", model_ids).items()}
         asked = [
             name
@@ -280,16 +296,6 @@ class Models:
             raise ValueError(f"model.ply of {model_id} has no valid .ply header")
         return int(count[1]), _DEGREE.get(len(_REST.findall(head)), 0)
 
-    def _digests(self, model_id: str) -> dict[str, str]:
-        """Return the SHA-256 of the files that `job.json` names."""
-        digests = json.loads(self.storage.get(layout.job_record(model_id))).get("sha256")
-        digests_by_name = digests.items() if isinstance(digests, dict) else ()
-        return {
-            name: digest
-            for name, digest in digests_by_name
-            if isinstance(digest, str) and _SHA256.fullmatch(digest)
-        }
-
     def _quality(self, model_id: str) -> tuple[Any, Any]:
         """Return PSNR (dB) and SSIM of the last measurement; None if no photos were held out."""
         try:
@@ -298,6 +304,17 @@ class Models:
             return None, None
         measured = [point for point in report.curve if point.psnr is not None]
         return (measured[-1].psnr, measured[-1].ssim) if measured else (None, None)
+
+
+def _digests(record: Mapping[str, Any]) -> dict[str, str]:
+    """Return the SHA-256 of the files that a `job.json` names."""
+    digests = record.get("sha256")
+    digests_by_name = digests.items() if isinstance(digests, dict) else ()
+    return {
+        name: digest
+        for name, digest in digests_by_name
+        if isinstance(digest, str) and _SHA256.fullmatch(digest)
+    }
 
 
 def _ended(record: Job) -> Ended:

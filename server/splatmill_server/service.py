@@ -42,6 +42,7 @@ from splatmill_server.jobs.finished import Finished
 from splatmill_server.jobs.records import Jobs
 from splatmill_server.models import Models
 from splatmill_server.shares import Shares
+from splatmill_server.space.bin import Bin
 from splatmill_server.space.deletion import Deletion
 from splatmill_server.space.ledger import Ledger
 from splatmill_server.space.quota import Quota
@@ -123,6 +124,7 @@ class Service:
     quota: Quota
     admission: Admission
     deletion: Deletion
+    bin: Bin
     relisting: Relisting
     sweeper: Sweeper
     closing: asyncio.Event = field(default_factory=asyncio.Event)
@@ -139,12 +141,13 @@ class Service:
         jobs = Jobs(connection, storage, metrics, lists)
         models = Models(storage, jobs, lists)
         captures = Captures(storage, settings, metrics, lists)
-        # Queued jobs do not wait for the others.
-        lists.makers += [jobs.make_lists, captures.make_lists, models.make_lists]
         usage = Usage(storage, Ledger(connection))
         quota = Quota(usage, captures, settings.quota)
         jobs.on_end.append(quota.job_ended)
         deletion = Deletion(connection, storage, captures, jobs, usage.ledger)
+        records_bin = Bin(connection, storage, captures, jobs, deletion)
+        # Queued jobs do not wait for the others; what is in the bin is known before it could be listed.
+        lists.makers += [jobs.make_lists, records_bin.make, captures.make_lists, models.make_lists]
         outgoing = Outgoing(settings.outgoing_allow)
         webhooks = Webhooks(storage, jobs)
         renderer = _renderer(settings, metrics)
@@ -180,10 +183,13 @@ class Service:
             ends=Ends(redis_async, jobs),
             usage=usage,
             quota=quota,
-            admission=Admission(storage, captures, jobs, models, quota),
+            admission=Admission(storage, captures, jobs, models, quota, records_bin),
             deletion=deletion,
+            bin=records_bin,
             relisting=Relisting(connection, storage, captures, models, settings.reaper_interval),
-            sweeper=Sweeper(usage, deletion, captures, models, _ages(settings), settings.sweep_interval),
+            sweeper=Sweeper(
+                usage, deletion, records_bin, captures, models, _ages(settings), settings.sweep_interval
+            ),
         )
 
     async def close(self) -> None:

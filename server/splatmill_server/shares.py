@@ -22,6 +22,7 @@ from splatmill.backplane.storage.records import FORMAT, check_format, reason, wa
 from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import (
     HELD_OUT,
+    BinKind,
     CreateShare,
     ModelCameras,
     Response,
@@ -154,11 +155,7 @@ class Shares:
         match = _TOKEN.fullmatch(token)
         share = self._load(layout.share_record(match[1], match[2])) if match else None
         if share is None or not hmac.compare_digest(share.sha256.encode(), _digest(token).encode()):
-            raise ProblemError(
-                "share_not_found",
-                "There is no such shared link; the model may have been deleted.",
-                advice="Check that the address is complete, or ask for a new link.",
-            )
+            raise _no_such_link()
         if not share.active:
             verb = "was revoked" if share.revoked_at is not None else "expired"
             raise ProblemError(
@@ -167,6 +164,8 @@ class Shares:
                 advice="Ask whoever sent it for a new one.",
             )
         self.models.check(share.model)
+        if self.storage.exists(layout.binned(BinKind.job, share.model)):
+            raise _no_such_link()
         return share
 
     def get_model(self, share: StoredShare) -> SharedModel:
@@ -204,6 +203,14 @@ class Shares:
     def _store(self, share: StoredShare) -> None:
         record = share.model_dump(mode="json", exclude_none=True)
         self.storage.put(layout.share_record(share.model, share.id), json.dumps(record, indent=1).encode())
+
+
+def _no_such_link() -> ProblemError:
+    return ProblemError(
+        "share_not_found",
+        "There is no such shared link; the model may have been deleted.",
+        advice="Check that the address is complete, or ask for a new link.",
+    )
 
 
 def _digest(token: str) -> str:

@@ -1,5 +1,6 @@
-"""The lists of jobs and models over the real service: filters, pages, pictures, storage, delete. What a single job or
-model shows is tested with those pages.
+"""The lists of jobs and models over the real service: filters, pages, pictures, storage, names, the bin.
+
+What a single job or model shows is tested with those pages.
 """
 
 from __future__ import annotations
@@ -20,6 +21,11 @@ def cancelled_jobs(service: Up, capture: str, count: int) -> list[str]:
         service.http.post(f"/v1/jobs/{job}/cancel")
     assert {service.ended(job)["state"] for job in ids} == {"cancelled"}
     return ids
+
+
+def binned(service: Up) -> list[str]:
+    """The ids of what is in the bin."""
+    return [entry["id"] for entry in service.http.get("/v1/bin").json()["entries"]]
 
 
 def test_a_model_is_listed_with_picture_and_figures(service: Up, model: SmallModel, page: Page) -> None:
@@ -61,10 +67,66 @@ def test_jobs_are_filtered_paged_and_deleted(service: Up, model: SmallModel, pag
 
     chosen = entries.filter(has_text="series 05")
     chosen.get_by_role("button", name="Delete").click()
-    page.get_by_role("button", name="Keep").press("Enter")
-    expect(entries).to_have_count(10)
-    chosen.get_by_role("button", name="Delete").click()
-    page.get_by_role("dialog").get_by_role("button", name="Delete").click()
     expect(entries).to_have_count(9)
-    assert service.http.get(f"/v1/jobs/{ids[5]}").status_code == 404
     expect(entries.filter(has_text="series 04").get_by_role("link")).to_be_focused()
+    page.get_by_role("button", name="Undo").click()
+    expect(entries).to_have_count(10)
+    assert binned(service) == []
+
+    page.get_by_role("button", name="Select", exact=True).click()
+    for number in (1, 3, 7):
+        entries.filter(has_text=f"series 0{number}").get_by_role("checkbox").check()
+    page.get_by_role("button", name="Delete 3 selected").click()
+    expect(entries).to_have_count(7)
+    assert set(binned(service)) == {ids[1], ids[3], ids[7]}
+    expect(page.get_by_role("button", name="Delete selected")).to_be_disabled()
+
+    page.goto("/models")
+    section = page.get_by_role("region", name="Bin", exact=True)
+    expect(section.get_by_role("row")).to_have_count(4)
+    section.get_by_role("button", name="Restore series 03").click()
+    expect(section.get_by_role("row")).to_have_count(3)
+    assert service.http.get(f"/v1/jobs/{ids[3]}").status_code == 200
+    section.get_by_role("button", name="Delete series 07 now").click()
+    page.get_by_role("button", name="Delete for good").click()
+    expect(section.get_by_role("row")).to_have_count(2)
+    assert service.http.get(f"/v1/jobs/{ids[7]}").status_code == 404
+    assert binned(service) == [ids[1]]
+    section.get_by_role("button", name="Restore series 01").click()
+    expect(section).to_be_hidden()
+
+
+def test_photos_are_deleted_and_restored(service: Up, model: SmallModel, page: Page) -> None:
+    capture = service.http.post("/v1/captures", json={"name": "not needed"}).json()["id"]
+    photo = b"x" * (64 << 20)  # among the largest
+    assert service.http.put(f"/v1/captures/{capture}/images/a.mp4", content=photo).status_code == 201
+    page.goto("/models")
+    page.get_by_role("button", name="Delete the photos not needed").click()
+    row = page.get_by_role("region", name="Bin", exact=True).get_by_role("row").filter(has_text="not needed")
+    expect(row).to_contain_text("Photos")
+    expect(page.get_by_role("button", name="Delete the photos not needed")).to_have_count(0)
+    assert binned(service) == [capture]
+    page.get_by_role("button", name="Undo").click()
+    expect(page.get_by_role("button", name="Delete the photos not needed")).to_be_visible()
+    assert binned(service) == []
+    assert service.http.delete(f"/v1/captures/{capture}").status_code == 204
+
+
+def test_a_model_and_its_job_are_renamed(service: Up, model: SmallModel, page: Page) -> None:
+    name = "<b>Vase</b> & Blumen 🌷"
+    try:
+        for path, address in ((f"/models/{model.id}", name), (f"/jobs/{model.id}", "again")):
+            page.goto(path)
+            page.get_by_role("button", name="Rename").click()
+            field = page.get_by_role("dialog").get_by_label("Name")
+            expect(field).to_be_focused()
+            field.fill(address)
+            field.press("Enter")
+            expect(page.get_by_role("heading", level=1)).to_have_text(address)
+            expect(page.get_by_role("button", name="Rename")).to_be_focused()
+            assert service.http.get(f"/v1/models/{model.id}").json()["name"] == address
+        page.get_by_role("button", name="Rename").click()
+        page.get_by_role("dialog").get_by_role("button", name="Keep").click()
+        expect(page.get_by_role("heading", level=1)).to_have_text("again")
+    finally:
+        service.http.patch(f"/v1/models/{model.id}", json={"name": "still life"})

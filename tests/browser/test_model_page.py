@@ -257,7 +257,7 @@ def test_a_model_that_is_not_there_is_said(visit: Visit) -> None:
 def test_deleting_asks_first(model: SmallModel, shown: Page) -> None:
     shown.get_by_role("button", name="Delete").click()
     dialog = shown.get_by_role("dialog")
-    expect(dialog).to_contain_text("This cannot be undone")
+    expect(dialog).to_contain_text("restored for a day")
     dialog.get_by_role("button", name="Keep").click()
     expect(dialog).to_have_count(0)
     assert shown.url.endswith(model.id)
@@ -299,7 +299,8 @@ def test_a_crop_makes_a_new_model_and_keeps_the_first(service: Up, model: SmallM
     shown.get_by_role("button", name="Delete").click()
     shown.get_by_role("button", name="Delete the model").click()
     shown.wait_for_url("**/models", timeout=WAIT)
-    assert service.http.get(f"/v1/models/{made['id']}").status_code == 404
+    assert [entry["id"] for entry in service.http.get("/v1/bin").json()["entries"]] == [made["id"]]
+    assert service.http.delete(f"/v1/jobs/{made['id']}").status_code == 204
     assert service.http.get(f"/v1/models/{model.id}").json() == first
 
 

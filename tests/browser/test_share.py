@@ -109,7 +109,7 @@ def test_a_link_shows_the_scene_and_its_files(
 
     with visit.page.expect_download() as downloading:
         visit.page.locator("#downloads a[href$='/download/ply']").click()
-    assert downloading.value.suggested_filename == f"{model.id}.ply"
+    assert downloading.value.suggested_filename == "still life.ply"
     stored = service.http.get(f"/v1/models/{model.id}/files/model.ply").content
     assert downloading.value.path().read_bytes() == stored
     assert f'{link["path"]}/embed"' in visit.page.get_by_label("HTML of a frame").input_value()

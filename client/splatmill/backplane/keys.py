@@ -21,6 +21,9 @@ LISTED = PREFIX + "listed"
 LISTING = PREFIX + "listing"
 """Lock of the API process that makes the lists anew."""
 
+BIN = PREFIX + "bin"
+"""Hash of what is in the bin: `<kind>/<id>` to its record. Only the server writes it, after storage."""
+
 RESTORED = PREFIX + "restored"
 """Set of the jobs that were restored from storage and may still have a process that runs them. It expires."""
 

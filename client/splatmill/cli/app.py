@@ -21,7 +21,9 @@ COMMANDS = {
     "logs": ("splatmill.cli.commands.attach", "logs"),
     "cancel": ("splatmill.cli.commands.jobs", "cancel"),
     "restart": ("splatmill.cli.commands.jobs", "restart"),
+    "rename": ("splatmill.cli.commands.jobs", "rename"),
     "delete": ("splatmill.cli.commands.delete", "delete"),
+    "bin": ("splatmill.cli.commands.bin", "bin_commands"),
     "models": ("splatmill.cli.commands.records", "models"),
     "download": ("splatmill.cli.commands.models", "download"),
     "shares": ("splatmill.cli.commands.shares", "shares"),
@@ -44,7 +46,7 @@ COMMANDS = {
 # The commands under each heading of `splatmill --help`; those without one are under the last heading.
 HEADINGS = {
     "Make a model": ("train", "fit-image", "options"),
-    "Jobs on a server": ("jobs", "status", "follow", "logs", "cancel", "restart", "delete"),
+    "Jobs on a server": ("jobs", "status", "follow", "logs", "cancel", "restart", "rename", "delete", "bin"),
     "Models and captures": (
         "models",
         "download",

@@ -107,6 +107,7 @@ if TYPE_CHECKING:
         Scope,
         Use,
     )
+    from splatmill.schema.resources.bin import BinKind, BinList, Binned
     from splatmill.schema.resources.captures import (
         SHA256_HEADER,
         Capture,
@@ -168,6 +169,7 @@ if TYPE_CHECKING:
         JobPage,
         LogLine,
         LogPage,
+        Rename,
     )
     from splatmill.schema.resources.live import (
         SNAPSHOT_MEDIA_TYPE,
@@ -267,6 +269,9 @@ __all__ = [
     "Accepted",
     "Backend",
     "Background",
+    "BinKind",
+    "BinList",
+    "Binned",
     "Box",
     "ByteSize",
     "CameraSpec",
@@ -362,6 +367,7 @@ __all__ = [
     "ProgressEvent",
     "QueueInfo",
     "Ready",
+    "Rename",
     "RenderRequest",
     "Report",
     "Request",

@@ -73,6 +73,7 @@ PROBLEMS: dict[str, Kind] = {
     "name_taken": Kind(409, "Another file is stored under this name"),
     "capture_in_use": Kind(409, "A job is using this capture"),
     "model_in_use": Kind(409, "A job starts from this model"),
+    "not_in_bin": Kind(404, "It is not in the bin"),
     "job_running": Kind(409, "The job is still running"),
     "job_finished": Kind(409, "The job has already ended"),
     # The uploaded files.

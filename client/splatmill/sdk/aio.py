@@ -30,6 +30,7 @@ from splatmill.schema import (
 )
 from splatmill.schema.files.formats import is_model_file
 from splatmill.sdk.arguments import TrainArguments
+from splatmill.sdk.bin import AsyncBin
 from splatmill.sdk.imports import AsyncImports
 from splatmill.sdk.job import AsyncJobHandle
 from splatmill.sdk.keys import AsyncKeys
@@ -91,6 +92,7 @@ class AsyncClient:
             proxy=proxy,
         )
         self.keys = AsyncKeys(self.connection)
+        self.bin = AsyncBin(self.connection)
         self.webhooks = AsyncWebhooks(self.connection)
         self.imports = AsyncImports(self.connection)
 

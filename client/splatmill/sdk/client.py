@@ -35,7 +35,7 @@ from splatmill.schema import (
 )
 from splatmill.sdk.aio import AsyncClient
 from splatmill.sdk.arguments import OrbitArguments, RenderArguments, TrainArguments
-from splatmill.sdk.client_records import Imports, Keys, Orbits, Shares, Webhooks
+from splatmill.sdk.client_records import Bin, Imports, Keys, Orbits, Shares, Webhooks
 from splatmill.sdk.job import MOST_LINES, AsyncJobHandle
 from splatmill.sdk.loop import BackgroundLoop
 from splatmill.sdk.model import AsyncModelHandle
@@ -83,6 +83,10 @@ class ModelHandle:
         Raises NotFound for an unknown format, DownloadFailed, ConnectionFailed, a subclass of `Refused`, or OSError.
         """
         return self._loop.run(self._async.download_as(format, path, on_bytes=on_bytes))
+
+    def rename(self, name: str | None) -> Model:
+        """Name the model, and its job with it; None takes the name away. Returns the record."""
+        return self._loop.run(self._async.rename(name))
 
     def delete(self) -> None:
         """Delete the model with its job, its report and its files. The capture is kept."""
@@ -187,6 +191,10 @@ class JobHandle:
     def refresh(self) -> Job:
         """Request the current record of the job."""
         return self._loop.run(self._async.refresh())
+
+    def rename(self, name: str | None) -> Job:
+        """Name the job, and its model with it; None takes the name away. Returns the record."""
+        return self._loop.run(self._async.rename(name))
 
     def events(self, after: str | None = None) -> Iterator[EventRecord]:
         """Yield the events of the job until it ends. A lost connection is restored without losing events.
@@ -304,6 +312,7 @@ class Client:
         )
         self._loop = BackgroundLoop()
         self.keys = Keys(self._loop, self._async.keys)
+        self.bin = Bin(self._loop, self._async.bin)
         self.webhooks = Webhooks(self._loop, self._async.webhooks)
         self.imports = Imports(self._loop, self._async.imports)
 

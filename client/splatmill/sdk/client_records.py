@@ -1,4 +1,4 @@
-"""The synchronous twins of the classes in `imports`, `keys`, `orbits`, `shares`, `webhooks`.
+"""The synchronous twins of the classes in `bin`, `imports`, `keys`, `orbits`, `shares`, `webhooks`.
 
 Generated from these by `python -m tests.support.synchronous`.
 """
@@ -9,6 +9,7 @@ from typing import Any, Unpack
 
 from splatmill.schema import (
     DEFAULT_OWNER,
+    Binned,
     Delivery,
     Import,
     Key,
@@ -24,6 +25,7 @@ from splatmill.schema import (
     WebhookWithSecret,
 )
 from splatmill.sdk.arguments import OrbitArguments
+from splatmill.sdk.bin import AsyncBin
 from splatmill.sdk.imports import AsyncImports
 from splatmill.sdk.keys import AsyncKeys
 from splatmill.sdk.loop import BackgroundLoop
@@ -32,6 +34,41 @@ from splatmill.sdk.shares import AsyncShares
 from splatmill.sdk.webhooks import AsyncWebhooks
 from splatmill.transfer.downloads import AnyPath
 from splatmill.transfer.uploads import OnProgress
+
+
+class Bin:
+    """Puts jobs with their models, and captures, into the bin of a server, lists and restores them.
+
+    Lists do not show what is in the bin, links to its models open nothing, and its bytes still count. The server
+    deletes it for good a day after it was put there.
+    """
+
+    def __init__(self, loop: BackgroundLoop, twin: AsyncBin) -> None:
+        self._loop = loop
+        self._async = twin
+
+    def list(self) -> list[Binned]:
+        """Return what is in the bin, the newest first."""
+        return self._loop.run(self._async.list())
+
+    def put_job(self, job_id: str) -> Binned:
+        """Put a job that has ended into the bin, with its model, which has the same id.
+
+        Raises NotFound, and Conflict for a job that has not ended or whose model an unfinished job starts from.
+        """
+        return self._loop.run(self._async.put_job(job_id))
+
+    def put_capture(self, capture_id: str) -> Binned:
+        """Put a capture into the bin. Raises NotFound, and Conflict for one that an unfinished job uses."""
+        return self._loop.run(self._async.put_capture(capture_id))
+
+    def restore_job(self, job_id: str) -> None:
+        """Restore a job and its model. Raises NotFound for one that is not in the bin."""
+        self._loop.run(self._async.restore_job(job_id))
+
+    def restore_capture(self, capture_id: str) -> None:
+        """Restore a capture. Raises NotFound for one that is not in the bin."""
+        self._loop.run(self._async.restore_capture(capture_id))
 
 
 class Imports:

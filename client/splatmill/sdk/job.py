@@ -59,6 +59,14 @@ class AsyncJobHandle:
         self.job = read_answer(Job, response)
         return self.job
 
+    async def rename(self, name: str | None) -> Job:
+        """Name the job, and its model with it; None takes the name away. Returns the record."""
+        response = await self.connection.request(
+            "PATCH", f"/v1/jobs/{self.id}", json={"name": name}, repeatable=True
+        )
+        self.job = read_answer(Job, response)
+        return self.job
+
     def events(self, after: str | None = None) -> AsyncIterator[EventRecord]:
         """Yield the events of the job until it ends. A lost connection is restored without losing events.
 

@@ -90,6 +90,14 @@ class AsyncModelHandle:
             self.connection, address, target_of(path, f"{self.id}.{format}"), on_bytes=on_bytes
         )
 
+    async def rename(self, name: str | None) -> Model:
+        """Name the model, and its job with it; None takes the name away. Returns the record."""
+        response = await self.connection.request(
+            "PATCH", f"/v1/models/{self.id}", json={"name": name}, repeatable=True
+        )
+        self.model = read_answer(Model, response)
+        return self.model
+
     async def delete(self) -> None:
         """Delete the model with its job, its report and its files. The capture is kept."""
         await self.connection.request("DELETE", f"/v1/jobs/{self.model.job}")

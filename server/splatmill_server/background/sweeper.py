@@ -3,6 +3,7 @@
 import asyncio
 import time
 from collections.abc import Callable
+from datetime import UTC, datetime
 
 import redis
 import structlog
@@ -17,6 +18,7 @@ from splatmill_server.base.problems import ProblemError
 from splatmill_server.captures.records import Captures
 from splatmill_server.models import Models
 from splatmill_server.space import leftovers
+from splatmill_server.space.bin import Bin
 from splatmill_server.space.deletion import Deletion
 from splatmill_server.space.holdings import sums
 from splatmill_server.space.job_uses import unfinished_jobs
@@ -43,6 +45,7 @@ class Sweeper:
         self,
         usage: Usage,
         deletion: Deletion,
+        records_bin: Bin,
         captures: Captures,
         models: Models,
         ages: Ages,
@@ -50,6 +53,7 @@ class Sweeper:
     ) -> None:
         self.usage = usage
         self.deletion = deletion
+        self.bin = records_bin
         self.captures = captures
         self.models = models
         self.ages = ages
@@ -89,6 +93,8 @@ class Sweeper:
         """Delete what is due, and return it."""
         for record in self.deletion.finish():
             log.info("finished a deletion that was cut off", record=record)
+        for binned in self.bin.delete_due(datetime.now(UTC)):
+            log.info("deleted from the bin", kind=binned.kind.value, id=binned.id, owner=binned.owner)
         self.usage.refresh(self.interval / 2)
         snapshot = self.usage.snapshot()
         self._list_missing(snapshot)

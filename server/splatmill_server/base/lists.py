@@ -19,7 +19,7 @@ from redis.lock import Lock
 
 from splatmill.backplane import expiry, keys, lists
 from splatmill.backplane.lists import NotListed
-from splatmill.schema import StoredKind
+from splatmill.schema import BinKind, StoredKind
 from splatmill_server.base.paging import read_cursor, write_cursor
 from splatmill_server.base.problems import ProblemError
 
@@ -173,6 +173,14 @@ class Lists:
         names = [keys.deleting(f"{kind.value}/{record_id}") for record_id in record_ids]
         marks = cast(list[bytes | None], self.connection.mget(names))
         return [record_id for record_id, mark in zip(record_ids, marks, strict=True) if mark is not None]
+
+    def binned(self, kind: BinKind, record_ids: Sequence[str]) -> set[str]:
+        """Return those of the records that are in the bin, which no list shows."""
+        if not record_ids:
+            return set()
+        fields = [f"{kind.value}/{record_id}" for record_id in record_ids]
+        marks = cast(list[bytes | None], self.connection.hmget(keys.BIN, fields))
+        return {record_id for record_id, mark in zip(record_ids, marks, strict=True) if mark is not None}
 
     def missing(self, kind: lists.Kind, record_ids: Sequence[str]) -> list[str]:
         """Return those of the records that are not listed."""

@@ -21,6 +21,7 @@ from splatmill.backplane.storage.records import FORMAT, UnreadableRecord, check_
 from splatmill.backplane.storage.storage import Storage, StorageError, StorageFullError
 from splatmill.schema import (
     DEFAULT_OWNER,
+    BinKind,
     Capture,
     CaptureFile,
     CapturePage,
@@ -166,10 +167,11 @@ class Captures:
 
         def read(capture_ids: Sequence[str]) -> dict[str, Capture]:
             captures = self._listed(capture_ids)
+            binned = self.lists.binned(BinKind.capture, capture_ids)
             return {
                 name: capture
                 for name, capture in captures.items()
-                if only.admits(capture.owner, capture.name)
+                if name not in binned and only.admits(capture.owner, capture.name)
             }
 
         names, narrowed = [lists.name("captures", owner=only.owner)], only.name is not None

@@ -18,6 +18,7 @@ from splatmill.backplane.storage.records import FORMAT, check_format, reason, wa
 from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import Job, LogEvent, LogLine
 from splatmill.schema.tolerant import keep_readable
+from splatmill_server.jobs import names
 
 
 def get(connection: redis.Redis, storage: Storage, job_id: str) -> list[LogLine]:
@@ -63,9 +64,12 @@ class StoredEnd:
 
 
 def get_stored_end(storage: Storage, job_id: str) -> StoredEnd | None:
-    """Return a job as it ended, from the file of its log, or None."""
+    """Return a job as it ended, from the file of its log, under its present name, or None."""
     end = _stored(storage, job_id)[0]
-    return end if end is not None and end.job.state.final else None
+    if end is None or not end.job.state.final:
+        return None
+    name = names.get(storage, job_id, end.job.name)
+    return StoredEnd(end.job.model_copy(update={"name": name}), end.generation)
 
 
 def text(lines: Iterable[LogLine]) -> str:

@@ -29,7 +29,7 @@ from splatmill_server.base.lists import Ended, Lists
 from splatmill_server.base.metrics import Metrics
 from splatmill_server.base.problems import ProblemError
 from splatmill_server.jobs import curve as job_curve
-from splatmill_server.jobs import listing, outcome, requests, restoring, shrinking
+from splatmill_server.jobs import listing, names, outcome, requests, restoring, shrinking
 from splatmill_server.jobs import log as job_log
 from splatmill_server.jobs.links import with_links
 from splatmill_server.jobs.queue_places import QueuePlaces
@@ -320,6 +320,25 @@ class Jobs:
         job_row = self.get_row(job_id)
         return self._placed(job_row) if _waits(job_row, self._job(job_row)) else None
 
+    def rename(self, job_id: str, name: str | None) -> Job:
+        """Name a job, and its model with it. Raises a 404 problem if there is no such job."""
+        self.get(job_id)
+        names.save(
+            self.storage, job_id, name
+        )  # first: a job that Redis loses from here on is restored with it
+
+        def set_name(pipe: Any) -> None:
+            known = pipe.exists(keys.job(job_id))
+            pipe.multi()
+            if known and name is not None:
+                pipe.hset(keys.job(job_id), "name", name)
+            elif known:
+                pipe.hdel(keys.job(job_id), "name")
+            pipe.hdel(keys.records("models"), job_id)
+
+        self.connection.transaction(set_name, keys.job(job_id))
+        return self.get(job_id)
+
     def restart(self, job_id: str, *, check: Callable[[], None], watched: Sequence[str]) -> Job:
         """Enqueue a job that has ended as a new generation, which resumes from its checkpoint if there is one.
 
@@ -508,10 +527,15 @@ def _waits(job_row: JobRow, job: Job) -> bool:
 
 
 def read_record(storage: Storage, job_id: str) -> Job:
-    """Return the job in the `job.json` of a model, without what is not readable in it.
+    """Return the job in the `job.json` of a model, without what is not readable in it, under its present name.
 
     Raises FileNotFoundError, and UnreadableRecord.
     """
+    return read_model_record(storage, job_id)[0]
+
+
+def read_model_record(storage: Storage, job_id: str) -> tuple[Job, dict[str, Any]]:
+    """Return the job in the `job.json` of a model, as `read_record` does, and all fields of that file."""
     try:
         record = json.loads(storage.get(layout.job_record(job_id)))
         check_format(record)
@@ -520,7 +544,7 @@ def read_record(storage: Storage, job_id: str) -> Job:
         raise UnreadableRecord(f"job.json cannot be read: {reason(error)}") from error
     if left_out:
         warn(layout.job_record(job_id), f"left out what cannot be read: {'; '.join(left_out)[:300]}")
-    return job
+    return job.model_copy(update={"name": names.get(storage, job_id, job.name)}), record
 
 
 def last_stage(job: Job) -> str | None:

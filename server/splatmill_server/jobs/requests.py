@@ -14,6 +14,7 @@ from splatmill.backplane.jobs.row import JobRow
 from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.records import UnreadableRecord, reason, warn
 from splatmill.backplane.storage.storage import Storage
+from splatmill_server.jobs import names
 
 
 def save(storage: Storage, begun: JobRow) -> None:
@@ -28,15 +29,16 @@ def next_generation(job_row: JobRow, moment: datetime, request: str | None) -> J
 
 
 def get(storage: Storage, job_id: str) -> JobRow | None:
-    """Return the row of an unfinished job, or None if there is none that can be read."""
+    """Return the row of an unfinished job, under its present name, or None if there is none that can be read."""
     path = layout.unfinished_job(job_id)
     try:
-        return JobRow.model_validate_json(storage.get(path))
+        begun = JobRow.model_validate_json(storage.get(path))
     except FileNotFoundError:
         return None
     except ValueError as error:
         warn(path, reason(error))
         return None
+    return begun.model_copy(update={"name": names.get(storage, job_id, begun.name)})
 
 
 def list_ids(storage: Storage) -> list[str]:

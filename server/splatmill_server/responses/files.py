@@ -59,7 +59,7 @@ async def _response(
         "Content-Type": media_type,
     }
     if download_name is not None:
-        headers["Content-Disposition"] = f"attachment; filename*=UTF-8''{quote(download_name)}"
+        headers["Content-Disposition"] = attachment(download_name)
     if media_type.startswith("text/html"):
         # A report contains file names chosen by users, so its page gets no access to this origin.
         headers["Content-Security-Policy"] = "sandbox allow-scripts"
@@ -82,6 +82,11 @@ async def _response(
     except FileNotFoundError:
         raise ProblemError("file_not_found", f"There is no file at {request.url.path}.") from None
     return StreamingResponse(joined(first, chunks), status, headers)
+
+
+def attachment(name: str) -> str:
+    """Return the Content-Disposition of a file that browsers are to save under this name (RFC 6266)."""
+    return f"attachment; filename*=UTF-8''{quote(name, safe='')}"
 
 
 def matches(header: str | None, etag: str) -> bool:

@@ -8,7 +8,7 @@ from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import JSONResponse, Response
 
-from splatmill.schema import IDEMPOTENCY_HEADER, CreateJob, Job, JobPage, JobState
+from splatmill.schema import IDEMPOTENCY_HEADER, CreateJob, Job, JobPage, JobState, Rename
 from splatmill_server.access.caller import Caller, Who
 from splatmill_server.base.filters import JobFilter
 from splatmill_server.base.paging import DEFAULT_LIMIT
@@ -143,6 +143,12 @@ def list_jobs(
 def get_job(service: Shared, job_id: JobId) -> Job:
     """Get a job."""
     return service.jobs.get(job_id)
+
+
+@router.patch("/{job_id}", responses=problems("job_not_found"))
+def rename_job(service: Shared, job_id: JobId, change: Rename) -> Job:
+    """Name a job, and its model with it."""
+    return service.jobs.rename(job_id, change.name)
 
 
 @router.delete(

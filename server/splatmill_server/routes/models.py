@@ -15,6 +15,7 @@ from splatmill.schema import (
     ModelDownloads,
     ModelPage,
     OrbitRequest,
+    Rename,
     RenderRequest,
     Scope,
 )
@@ -24,8 +25,9 @@ from splatmill_server.base.filters import Filter
 from splatmill_server.base.paging import DEFAULT_LIMIT
 from splatmill_server.requests.ownership import ListedOwner, ModelId
 from splatmill_server.requests.parameters import JSON_ONLY, Cursor, Limit, NamePart
+from splatmill_server.responses.files import attachment
 from splatmill_server.responses.forward import CLIENT_GONE, forward, while_connected
-from splatmill_server.responses.model_outputs import model_file, model_in_format, rendered_by_query
+from splatmill_server.responses.model_outputs import file_name, model_file, model_in_format, rendered_by_query
 from splatmill_server.responses.single_file import single_file
 from splatmill_server.routes.openapi import CAMERA, RENDER_REQUESTS, answer, binary, problems
 from splatmill_server.service import Shared
@@ -91,6 +93,12 @@ def get_model(service: Shared, model_id: ModelId) -> Model:
     return service.models.get(model_id)
 
 
+@router.patch("/{model_id}", responses=problems("model_not_found", "model_not_ready", "model_corrupt"))
+def rename_model(service: Shared, model_id: ModelId, change: Rename) -> Model:
+    """Name a model, and its job with it. Files of it are downloaded under its name."""
+    return service.models.rename(model_id, change.name)
+
+
 @router.head("/{model_id}/files/{name:path}", include_in_schema=False)
 @router.get(
     "/{model_id}/files/{name:path}",
@@ -140,7 +148,7 @@ async def download_html(service: Shared, who: Who, model_id: ModelId, request: R
         return single_file(model.name or model_id, service.storage.get(path), cameras, antialias)
 
     headers = {
-        "Content-Disposition": f"attachment; filename*=UTF-8''{model_id}.html",
+        "Content-Disposition": attachment(await run_in_threadpool(file_name, service, model_id, ".html")),
         "Content-Security-Policy": "sandbox allow-scripts",
         "Cache-Control": "private, no-cache",
     }

@@ -15,7 +15,7 @@ from splatmill.backplane import keys, lists
 from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.records import UnreadableRecord
 from splatmill.backplane.storage.storage import Storage
-from splatmill.schema import Capture, StoredKind
+from splatmill.schema import BinKind, Capture, StoredKind
 from splatmill_server.base.problems import ProblemError
 from splatmill_server.captures.records import Captures
 from splatmill_server.jobs.records import Jobs
@@ -50,17 +50,12 @@ class Deletion:
         owner = self._owner(capture_id)
         record = Holding(kind=StoredKind.capture, id=capture_id).key
         with self._marked(record) as mark:
-            if (use := self._user(record)) is not None:
-                raise ProblemError(
-                    "capture_in_use",
-                    f"The job {use.id} uses this capture and has not ended.",
-                    advice=f"Cancel it with POST /v1/jobs/{use.id}/cancel, or wait until it has ended.",
-                    facts={"job": use.id},
-                )
+            self.check_capture_unused(capture_id)
             if still is not None and not still():
                 return False
             mark.begin()
             self.captures.delete(capture_id)
+            self._leave_bin(BinKind.capture, capture_id)
             self.ledger.deleted(StoredKind.capture, capture_id, owner)
         return True
 
@@ -73,14 +68,7 @@ class Deletion:
         owner = self.jobs.get_owner(job_id)
         model = Holding(kind=StoredKind.model, id=job_id).key
         with self._marked(model) as mark:
-            use = self._user(model)
-            if use is not None and use.id != job_id:
-                raise ProblemError(
-                    "model_in_use",
-                    f"The job {use.id} starts from the model of this job and has not ended.",
-                    advice=f"Cancel it with POST /v1/jobs/{use.id}/cancel, or wait until it has ended.",
-                    facts={"job": use.id},
-                )
+            self.check_model_unused(job_id)
             if still is not None and not still():
                 return False
             mark.begin()
@@ -88,9 +76,36 @@ class Deletion:
                 job_id
             )  # refuses a job that has not ended; its links open nothing without the model
             self.storage.delete_prefix(layout.shares_of(job_id))
+            self._leave_bin(BinKind.job, job_id)
             for kind in (StoredKind.job, StoredKind.model):
                 self.ledger.deleted(kind, job_id, owner)
         return True
+
+    def check_capture_unused(self, capture_id: str) -> None:
+        """Raise a 409 problem if an unfinished job uses a capture."""
+        if (use := self._user(Holding(kind=StoredKind.capture, id=capture_id).key)) is not None:
+            raise ProblemError(
+                "capture_in_use",
+                f"The job {use.id} uses this capture and has not ended.",
+                advice=f"Cancel it with POST /v1/jobs/{use.id}/cancel, or wait until it has ended.",
+                facts={"job": use.id},
+            )
+
+    def check_model_unused(self, job_id: str) -> None:
+        """Raise a 409 problem if another unfinished job starts from the model of a job."""
+        use = self._user(Holding(kind=StoredKind.model, id=job_id).key)
+        if use is not None and use.id != job_id:
+            raise ProblemError(
+                "model_in_use",
+                f"The job {use.id} starts from the model of this job and has not ended.",
+                advice=f"Cancel it with POST /v1/jobs/{use.id}/cancel, or wait until it has ended.",
+                facts={"job": use.id},
+            )
+
+    def _leave_bin(self, kind: BinKind, record_id: str) -> None:
+        """Take a record that is deleted from the bin."""
+        self.storage.delete(layout.binned(kind, record_id))
+        self.connection.hdel(keys.BIN, f"{kind.value}/{record_id}")
 
     def work(self, job_id: str, still: Callable[[], bool]) -> bool:
         """Delete the files from which a job that has ended would resume. Return False if `still` does."""

@@ -218,6 +218,40 @@ def test_deleting_asks_on_a_terminal(at, jobs):
     assert invoke("status", jobs[0], *at).exit_code == Exit.not_found
 
 
+def test_renaming(at, jobs):
+    assert invoke("rename", jobs[0], "Vase 🌷", *at).stdout == f"The job {jobs[0]} is named Vase 🌷.\n"
+    assert json.loads(invoke("models", jobs[0], "--json", *at).stdout)["name"] == "Vase 🌷"
+    assert invoke("rename", jobs[0], "", *at).stdout == f"The job {jobs[0]} has no name.\n"
+    assert invoke("rename", jobs[0], "x" * 201, *at).exit_code != 0
+    assert invoke("rename", "0" * 16, "x", *at).exit_code == Exit.not_found
+
+
+def test_the_bin(service, at, jobs):
+    capture = capture_of(at, jobs[0])
+    assert invoke("bin", "list", *at).stdout == "The bin is empty.\n"
+    done = invoke("bin", "put", jobs[1], *at)
+    assert "has not ended" in done.stderr
+    for job_id in jobs[1:]:
+        invoke("cancel", job_id, *at)
+        service.say(job_id, StateEvent(state=JobState.cancelled))
+    done = invoke("bin", "put", jobs[0], capture, *at)
+    assert done.exit_code == 0, done.output
+    assert f"The job {jobs[0]} ({LONG}) is in the bin until" in done.stdout
+    assert f"The capture {capture} (kitchen photos) is in the bin until" in done.stdout
+    entries = [json.loads(line) for line in invoke("bin", "list", "--json", *at).stdout.splitlines()]
+    assert [(entry["kind"], entry["id"]) for entry in entries] == [("capture", capture), ("job", jobs[0])]
+    assert "kitchen photos" in invoke("bin", "list", *at).stdout
+    assert invoke("models", *at).stdout == "No model is finished.\n"
+    assert (
+        invoke("bin", "restore", jobs[0], capture, *at).stdout
+        == f"Restored {jobs[0]}.\nRestored {capture}.\n"
+    )
+    assert jobs[0] in invoke("models", *at).stdout
+    done = invoke("bin", "restore", capture, *at)
+    assert done.exit_code == Exit.not_found
+    assert "is not in the bin" in done.stderr
+
+
 def test_a_download_shows_a_bar_and_resumes(service, at, jobs, tmp_path: Path):
     model = PLY + bytes(3_000_000)
     service.storage.put(layout.model_file(jobs[0], "model.ply"), model)
@@ -271,6 +305,6 @@ def test_status_says_where_a_waiting_job_stands(service, at, photos):
     assert "before it" not in invoke("status", usual.id, *at).stdout
 
 
-@pytest.mark.parametrize("group", ["keys", "webhooks", "shares"])
+@pytest.mark.parametrize("group", ["keys", "webhooks", "shares", "bin"])
 def test_a_group_of_commands_offers_no_completion_of_its_own(group):
     assert "--show-completion" not in invoke(group, "--help").stdout

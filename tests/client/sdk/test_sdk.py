@@ -241,6 +241,26 @@ def test_deleting_captures_and_models(service, photos):
             client.capture(job.job.capture)
 
 
+def test_what_is_in_the_bin_can_be_restored(service, photos):
+    with Client(service.url) as client:
+        job = client.train(photos)
+        service.begin(job.id)
+        service.finish(job.id, PLY)
+        model = job.wait()
+        assert model.rename("Vase").name == job.refresh().name == job.rename("Vase").name == "Vase"
+        binned = client.bin.put_job(job.id)
+        assert (binned.name, binned.model) == ("Vase", model.id)
+        client.bin.put_capture(job.job.capture)
+        assert [*client.jobs(), *client.models(), *client.captures()] == []
+        assert {entry.id for entry in client.bin.list()} == {job.id, job.job.capture}
+        client.bin.restore_job(job.id)
+        client.bin.restore_capture(job.job.capture)
+        assert [found.id for found in client.models()] == [model.id]
+        with pytest.raises(NotFound):
+            client.bin.restore_job(job.id)
+        assert model.rename(None).name is None
+
+
 def test_all_jobs_page_by_page(service, photos):
     with Client(service.url) as client:
         capture, _ = client.upload(photos)

@@ -1,4 +1,4 @@
-"""`splatmill jobs`, `status`, `cancel`, `restart` and `options`."""
+"""`splatmill jobs`, `status`, `cancel`, `restart`, `rename` and `options`."""
 
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,6 +12,7 @@ from splatmill.cli.display.tables import (
     print_lines,
     print_record,
     print_table,
+    printable,
 )
 from splatmill.cli.servers import ServerOption, open_client
 from splatmill.schema import JobState
@@ -125,6 +126,19 @@ def restart(job_id: JobId, server: ServerOption = None) -> None:
     with open_client(server) as client:
         job = client.job(job_id).restart()
     typer.echo(f"The job {job.id} is {job.state.value}. See how it gets on: splatmill follow {job.id}")
+
+
+def rename(
+    job_id: JobId,
+    name: Annotated[str, typer.Argument(metavar="NAME", help='The new name; "" takes the name away.')],
+    server: ServerOption = None,
+) -> None:
+    """Name a job, and its model with it."""
+    with open_client(server) as client:
+        job = client.job(job_id).rename(name or None)
+    typer.echo(
+        f"The job {job.id} is named {printable(job.name)}." if job.name else f"The job {job.id} has no name."
+    )
 
 
 def options(as_json: JsonLines = False) -> None:

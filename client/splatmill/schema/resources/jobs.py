@@ -34,6 +34,12 @@ class CreateJob(Request):
         return self.model_dump_json(exclude=None if with_capture else {"capture"})
 
 
+class Rename(Request):
+    """A new name for a job and its model."""
+
+    name: Label | None = Field(description="A name to recognise it by; null for none.")
+
+
 def _readable_options(value: Any) -> Any:
     # A newer server may have options, or values of options, that this version does not know; its jobs, and the
     # records that it stored, must still be readable.

@@ -21,6 +21,7 @@ const ADVICE = {
   model_not_found: "It may have been deleted. The list of models shows those that are there.",
   model_not_ready: "Wait until its job has ended.",
   no_images: "Give photos, a video or a zip first.",
+  not_in_bin: "It was restored, or deleted for good after a day. Reload the page for the current list.",
   orbit_not_found: "It may have been deleted. Reload the page for the current list.",
   session_needs_key: "Sign in with a key.",
   share_not_found: "It may have been deleted with its model.",

@@ -107,8 +107,9 @@ function setTheme(name) {
  * Show a message until it is closed; those of the kind "good" close by themselves. Screen readers read it out.
  * @param {string | Error} message a Problem shows its advice too
  * @param {"info" | "good" | "warning" | "error"} [kind]
+ * @param {{text: string, act: () => unknown}} [action] a button of the message; it stays longer then
  */
-export function notify(message, kind = message instanceof Error ? "error" : "info") {
+export function notify(message, kind = message instanceof Error ? "error" : "info", action) {
   let region = document.querySelector(".notices");
   if (!region) {
     region = h("div", { class: "notices" });
@@ -116,9 +117,15 @@ export function notify(message, kind = message instanceof Error ? "error" : "inf
   }
   const box = noticeOf(message, kind);
   const close = () => box.remove();
-  box.querySelector(".row")?.append(h("button", { class: "quiet small push", type: "button", "aria-label": "Close the message", onclick: close }, "✕"));
+  if (action) {
+    box.querySelector(".row")?.append(h("button", { class: "small push", type: "button", onclick: () => {
+      close();
+      return action.act();
+    } }, action.text));
+  }
+  box.querySelector(".row")?.append(h("button", { class: action ? "quiet small" : "quiet small push", type: "button", "aria-label": "Close the message", onclick: close }, "✕"));
   region.append(box);
-  if (kind === "good") setTimeout(close, 6000);
+  if (kind === "good") setTimeout(close, action ? 20_000 : 6000);
 }
 
 /**

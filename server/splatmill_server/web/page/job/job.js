@@ -5,6 +5,7 @@ import { ErrorChart } from "../chart.js";
 import { byId, h } from "../dom.js";
 import { bytes, count, decibels, moment, number, seconds } from "../format.js";
 import { FINAL, badgeKind, badgeText } from "../job_states.js";
+import { renameButton } from "../naming.js";
 import { confirmAction, noticeOf, notify, startShell } from "../shell.js";
 import { Course } from "./course.js";
 import { LiveScene } from "./live_scene.js";
@@ -55,13 +56,17 @@ try {
 
 /** Follow the events from the first one on. */
 function begin() {
-  byId("name").textContent = job.name || `Job ${id}`;
+  showName();
   stream.close();
   stream = follow(id, heard, connection, () => {
     course = new Course();
     refresh();
   });
   again();
+}
+
+function showName() {
+  byId("name").textContent = job.name || `Job ${id}`;
 }
 
 /** @param {any} record */
@@ -253,10 +258,15 @@ function showActions() {
 
 function actions() {
   const other = h("a", { class: "button", href: `/?capture=${encodeURIComponent(job.capture)}&options_of=${encodeURIComponent(job.id)}` }, course.final ? "Train with other options" : "New job with other options");
+  const rename = renameButton(address, () => job.name ?? "", (record) => {
+    job = record;
+    showName();
+    again();
+  });
   if (!course.final) {
-    return [other, h("button", { type: "button", class: "danger", disabled: job.cancel_requested, onclick: cancel }, "Cancel")];
+    return [other, rename, h("button", { type: "button", class: "danger", disabled: job.cancel_requested, onclick: cancel }, "Cancel")];
   }
-  return [other, course.state === "succeeded" ? null : h("button", { type: "button", onclick: restart }, "Restart")].filter((part) => part !== null);
+  return [other, rename, course.state === "succeeded" ? null : h("button", { type: "button", onclick: restart }, "Restart")].filter((part) => part !== null);
 }
 
 async function cancel() {

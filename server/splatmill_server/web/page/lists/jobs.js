@@ -1,11 +1,12 @@
 // The list of jobs: state and progress of each, cancel, delete.
 
 import { Problem, get, send } from "../api.js";
+import { putInBin } from "../bin.js";
 import { h } from "../dom.js";
 import { ago, moment, seconds } from "../format.js";
 import { FINAL, RUNNING, badgeKind, badgeText } from "../job_states.js";
 import { listing } from "./listing.js";
-import { confirmAction, notify, startShell } from "../shell.js";
+import { confirmAction, startShell } from "../shell.js";
 
 const REFRESH_MS = 4000; // between two requests for the unfinished jobs, while the page is visible
 
@@ -67,16 +68,13 @@ async function cancel(job) {
 }
 
 /** @param {any} job */
-async function remove(job) {
-  const yes = await confirmAction({
-    title: "Delete this job?",
-    text: job.model ? "Its model, the report and all links to it are deleted too. The photos are kept." : "Its log is deleted too. The photos are kept.",
-    action: "Delete",
-  });
-  if (!yes) return;
-  await send("DELETE", `/v1/jobs/${job.id}`);
-  list.remove(job.id);
-  notify("The job is deleted.", "good");
+function remove(job) {
+  return removeAll([job]);
+}
+
+/** Put jobs into the bin, with their models. @param {any[]} jobs */
+function removeAll(jobs) {
+  return putInBin(jobs.map(({ id }) => ({ kind: "job", id })), ["job", "jobs"], (ids) => ids.forEach(list.remove), list.reload);
 }
 
 async function refresh() {
@@ -99,6 +97,8 @@ const list = await listing({
   limit: 30,
   query: ({ name, state }) => ({ name, state: state === "running" ? RUNNING : state }),
   entry,
+  deleteAll: removeAll,
+  deletable: (job) => FINAL.includes(job.state),
   empty: () => h("span", {}, "There are no jobs yet. ", h("a", { href: "/" }, "Start with some photos"), "."),
 });
 setInterval(refresh, REFRESH_MS);

@@ -1,7 +1,7 @@
 // A list that is filtered, loaded page by page, and keeps its filters in the page's address.
 
 import { get } from "../api.js";
-import { byId } from "../dom.js";
+import { byId, h, toggle } from "../dom.js";
 
 const TYPING_MS = 250; // a pause in typing after which the list is asked for again
 
@@ -13,9 +13,11 @@ const TYPING_MS = 250; // a pause in typing after which the list is asked for ag
  * @param {(filters: Record<string, string>) => import("../api.js").Query} list.query what the server is asked for
  * @param {(record: any) => HTMLElement} list.entry returns the entry of a record, an `<li>`
  * @param {() => (Node | string)} list.empty what to say where there is nothing at all
+ * @param {(records: any[]) => Promise<unknown>} list.deleteAll deletes the records that were selected
+ * @param {(record: any) => boolean} [list.deletable] whether a record can be selected
  * @returns {Promise<{reload: () => Promise<void>, remove: (id: string) => void, update: (record: any) => void, records: () => any[]}>}
  */
-export async function listing({ noun, limit, query, entry, empty }) {
+export async function listing({ noun, limit, query, entry, empty, deleteAll, deletable = () => true }) {
   const form = /** @type {HTMLFormElement} */ (byId("filters"));
   const box = byId("list");
   const more = /** @type {HTMLButtonElement} */ (byId("more"));
@@ -34,9 +36,44 @@ export async function listing({ noun, limit, query, entry, empty }) {
     if (control instanceof HTMLInputElement || control instanceof HTMLSelectElement) control.value = value;
   }
 
+  // Several records are selected by checkboxes, which are shown only then.
+  /** @type {Set<string>} */
+  const selected = new Set();
+  const deleteSelected = h("button", { class: "danger", type: "button", disabled: true, hidden: true, onclick: async () => {
+    const chosen = [...shown.values()].map(({ record }) => record).filter(({ id }) => selected.has(id));
+    selected.clear();
+    saySelected();
+    await deleteAll(chosen);
+  } });
+  const selecting = toggle("Select", (on) => {
+    selected.clear();
+    box.classList.toggle("selecting", on);
+    for (const check of box.querySelectorAll(".select input")) /** @type {HTMLInputElement} */ (check).checked = false;
+    deleteSelected.hidden = !on;
+    saySelected();
+  });
+  form.append(h("div", { class: "row push" }, deleteSelected, selecting));
+
+  function saySelected() {
+    deleteSelected.disabled = selected.size === 0;
+    deleteSelected.textContent = selected.size ? `Delete ${selected.size} selected` : "Delete selected";
+  }
+
+  /** @param {any} record */
+  function checkbox(record) {
+    const check = h("input", { type: "checkbox", "aria-label": `Select ${record.name || record.id.slice(0, 8)}`, disabled: !deletable(record), onchange: () => {
+      if (check.checked) selected.add(record.id);
+      else selected.delete(record.id);
+      saySelected();
+    } });
+    check.checked = selected.has(record.id);
+    return h("label", { class: "select" }, check);
+  }
+
   /** @param {any} record */
   function show(record) {
     const element = entry(record);
+    element.append(checkbox(record));
     const known = shown.get(record.id);
     if (known) known.element.replaceWith(element);
     else box.append(element);
@@ -77,6 +114,8 @@ export async function listing({ noun, limit, query, entry, empty }) {
     const chosen = new URLSearchParams(Object.entries(filters()).filter(([, value]) => value));
     history.replaceState(null, "", chosen.size ? `?${chosen}` : location.pathname);
     shown.clear();
+    selected.clear();
+    saySelected();
     box.replaceChildren();
     cursor = null;
     await load();
@@ -116,6 +155,8 @@ export async function listing({ noun, limit, query, entry, empty }) {
       const beside = known.element.nextElementSibling ?? known.element.previousElementSibling;
       known.element.remove();
       shown.delete(id);
+      selected.delete(id);
+      saySelected();
       say();
       if (left) (/** @type {HTMLElement | null} */ (beside?.querySelector("a")) ?? byId("main")).focus();
     },

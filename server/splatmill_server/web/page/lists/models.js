@@ -1,11 +1,13 @@
 // The list of models with their pictures, and what they occupy in storage.
 
-import { get, modelAddress, send } from "../api.js";
+import { get, modelAddress } from "../api.js";
+import { putInBin } from "../bin.js";
 import { append, byId, h } from "../dom.js";
 import { ago, bytes, decibels, moment, number } from "../format.js";
 import { listing } from "./listing.js";
 import { openSharing } from "../sharing.js";
-import { confirmAction, notify, startShell } from "../shell.js";
+import { startShell } from "../shell.js";
+import { showBin } from "./bin_table.js";
 
 /** @param {any} model */
 function entry(model) {
@@ -22,28 +24,36 @@ function entry(model) {
         h("span", { title: moment(model.created_at) }, ago(model.created_at)),
         h("span", { class: "actions push" },
           h("button", { class: "quiet small", type: "button", onclick: () => openSharing(modelAddress(model.id), name) }, "Share", h("span", { class: "visually-hidden" }, ` ${name}`)),
-          h("button", { class: "quiet small", type: "button", onclick: () => remove(model, name) }, "Delete", h("span", { class: "visually-hidden" }, ` ${name}`))))));
+          h("button", { class: "quiet small", type: "button", onclick: () => removeAll([model]) }, "Delete", h("span", { class: "visually-hidden" }, ` ${name}`))))));
 }
 
-/** @param {any} model @param {string} name */
-async function remove(model, name) {
-  const yes = await confirmAction({
-    title: `Delete ${name}?`, text: "Its job, the report and all links to it are deleted too. The photos are kept.", action: "Delete",
-  });
-  if (!yes) return;
-  await send("DELETE", `/v1/jobs/${model.job}`);
-  list.remove(model.id);
-  notify("The model is deleted.", "good");
-  await storage();
+/** Put models into the bin, with their jobs. @param {any[]} models */
+function removeAll(models) {
+  return putInBin(models.map(({ job }) => ({ kind: "job", id: job })), ["model", "models"], (ids) => {
+    ids.forEach(list.remove);
+    return stored();
+  }, back);
+}
+
+/** What was in the bin is listed again. */
+async function back() {
+  await list.reload();
+  await stored();
+}
+
+/** Show what is in storage and in the bin. */
+async function stored() {
+  await storage(await showBin(byId("bin"), back));
 }
 
 const KINDS = /** @type {const} */ ([
   ["captures", "Photos", "s1"], ["models", "Models", "s2"], ["sfm", "Cameras", "s3"], ["jobs", "Checkpoints", "s4"],
 ]);
 
-/** Show what the caller's records occupy: a bar, its key with the figures, and the largest records. */
-async function storage() {
-  const use = await get("/v1/storage", { largest: 6 });
+/** Show what the caller's records occupy: a bar, its key with the figures, and the largest records but those in the bin. @param {Set<string>} inBin */
+async function storage(inBin) {
+  const use = await get("/v1/storage", { largest: 6 + inBin.size });
+  const largest = use.largest.filter((/** @type {any} */ record) => !inBin.has(record.id)).slice(0, 6);
   const body = byId("storage-body");
   body.replaceChildren();
   for (const owner of use.owners) {
@@ -56,19 +66,29 @@ async function storage() {
       h("ul", { class: "key" }, kinds.map(({ text, swatch, size }) => h("li", { class: swatch }, `${text} ${bytes(size)}`))),
     ]);
   }
-  if (use.largest.length) {
-    const expire = use.largest.some((/** @type {any} */ record) => record.expires_at);
+  if (largest.length) {
+    const expire = largest.some((/** @type {any} */ record) => record.expires_at);
     append(body, [h("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "Largest records" }, h("table", { class: "table" },
       h("caption", {}, "The largest records"),
-      h("thead", {}, h("tr", {}, ["What", "Name", "Last used", ...(expire ? ["Deleted"] : [])].map((text) => h("th", { scope: "col" }, text)), h("th", { scope: "col", class: "number" }, "Size"))),
-      h("tbody", {}, use.largest.map((/** @type {any} */ record) => h("tr", {},
+      h("thead", {}, h("tr", {}, ["What", "Name", "Last used", ...(expire ? ["Deleted"] : [])].map((text) => h("th", { scope: "col" }, text)), h("th", { scope: "col", class: "number" }, "Size"), h("td", {}))),
+      h("tbody", {}, largest.map((/** @type {any} */ record) => h("tr", {},
         h("td", {}, { capture: "Photos", job: "Checkpoints", model: "Model" }[/** @type {string} */ (record.kind)] ?? record.kind),
         h("td", {}, place(record)),
         h("td", {}, ago(record.last_used)),
         expire ? h("td", {}, record.expires_at ? ago(record.expires_at) : "not by itself") : null,
-        h("td", { class: "number" }, bytes(record.bytes)))))))]);
+        h("td", { class: "number" }, bytes(record.bytes)),
+        h("td", {}, record.kind === "capture" ? deletePhotos(record) : null))))))]);
   }
   byId("storage").hidden = use.owners.length === 0;
+}
+
+/** A button that puts the photos of a capture into the bin. @param {any} record */
+function deletePhotos({ id, name, needed_by: user }) {
+  const text = name || id.slice(0, 8);
+  return h("button", {
+    class: "quiet small", type: "button", disabled: Boolean(user), title: user ? `The job ${user.slice(0, 8)} needs them.` : null, "aria-label": `Delete the photos ${text}`,
+    onclick: () => putInBin([{ kind: "capture", id }], ["set of photos", "sets of photos"], stored, stored),
+  }, "Delete");
 }
 
 /** @param {any} record */
@@ -101,6 +121,7 @@ const list = await listing({
   limit: 24,
   query: ({ name }) => ({ name }),
   entry,
+  deleteAll: removeAll,
   empty: () => h("span", {}, "There are no models yet. ", h("a", { href: "/" }, "Start with some photos"), "."),
 });
-await storage();
+await stored();

@@ -9,7 +9,9 @@ import { showCameras } from "./cameras.js";
 import { showDownloads } from "./downloads.js";
 import { showOrbit } from "./orbit.js";
 import { Stage } from "./stage.js";
+import { binned } from "../bin.js";
 import { figures } from "../figures.js";
+import { renameButton } from "../naming.js";
 import { openSharing } from "../sharing.js";
 import { confirmAction, noticeOf, startShell } from "../shell.js";
 
@@ -47,9 +49,7 @@ async function load(address) {
 /** @param {Shown} shown */
 async function show(shown) {
   const { model } = shown;
-  const name = model.name || `Model ${model.id}`;
-  document.title = `${name} - Splatmill`;
-  byId("title").textContent = name;
+  showName(model);
   byId("lead").append(...figures(model), ` · ${bytes(model.bytes)} · made ${ago(model.created_at)}`);
   byId("actions").append(...actions(shown));
   byId("whole").hidden = false;
@@ -61,11 +61,22 @@ async function show(shown) {
   await stage.open();
 }
 
+/** @param {any} model */
+function showName(model) {
+  const name = model.name || `Model ${model.id}`;
+  document.title = `${name} - Splatmill`;
+  byId("title").textContent = name;
+}
+
 /** @param {Shown} shown */
 function actions({ model, address }) {
   const has = model.files.some((/** @type {any} */ file) => file.name === "report.html");
   return [
     h("button", { type: "button", onclick: () => openSharing(address, model.name || `Model ${model.id}`) }, "Share"),
+    renameButton(address, () => model.name ?? "", (record) => {
+      model.name = record.name;
+      showName(model);
+    }),
     has && h("a", { class: "button", href: `${address}/files/report.html`, target: "_blank", rel: "noopener" }, "Report"),
     h("a", { class: "button", href: `/jobs/${encodeURIComponent(model.job)}` }, "Job"),
     h("button", { class: "danger", type: "button", onclick: () => remove(model) }, "Delete"),
@@ -76,10 +87,10 @@ function actions({ model, address }) {
 async function remove(model) {
   const yes = await confirmAction({
     title: "Delete this model?",
-    text: "The model, its report, its files and its job are deleted. The photos are kept. This cannot be undone.",
+    text: "The model, its report, its files and its job go to the bin, from where they can be restored for a day. Links to the model open nothing meanwhile. The photos are kept.",
     action: "Delete the model",
   });
   if (!yes) return;
-  await request("DELETE", `/v1/jobs/${encodeURIComponent(model.job)}`);
+  await request("PUT", binned("job", model.job));
   location.assign(at("/models"));
 }
