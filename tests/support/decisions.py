@@ -151,12 +151,14 @@ def factors() -> dict[str, dict[str, Forced]]:
 
 
 def refused(known: Mapping[str, Mapping[str, Forced]]) -> set[Pair]:
-    """The pairs that a run refuses: without points there is nothing to seed or to compare beside."""
+    """The pairs that a run refuses: without points there is nothing to seed or to compare, and not all kernels cull."""
     found = {
         frozenset(((name, "on"), ("initial", initial)))
         for name in ("far_shell", "gaps")
         for initial in ("hull", "random", "model")
     } | {frozenset((("exposure", "on"), ("initial", initial))) for initial in ("hull", "random")}
+    for backend in {"gpu", "reference"} & set(known["backend"]):
+        found.add(frozenset((("cluster_culling", "on"), ("backend", backend))))
     if "gpu" in known["backend"]:
         found.add(frozenset((("pose_refinement", "on"), ("backend", "gpu"))))
     return found

@@ -54,6 +54,7 @@ PARTS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
         Coverage,
         {
             "sightings": 80.0,
+            "in_view": 0.8,
             "sky_share": 0.0,
             "gap_share": 0.0,
             "gap_points": 0,

@@ -49,6 +49,8 @@ PROJECTION = [
     for x in ("project_agrees_with_the_definition", "gradient_of_project_agrees_with_the_definition")
 ]
 PROOFS = {
+    "cpu/clusters": ["test_cpu_clusters.py"],
+    "cpu/pack": ["test_cpu_step.py", "test_cpu_clusters.py"],
     "cpu/adam": ["test_adam.py", "test_cpu_step.py"],
     "cpu/loss": ["test_loss.py"],
     "cpu/knn": ["test_knn.py"],
@@ -100,8 +102,8 @@ FUNCTIONS = "test_functions.py"
 
 ALL = [
     "test_proof_backward.py", "test_proof_forward.py", "test_proof_step.py", "test_cpu_step.py", "test_cpu_pose.py",
-    "test_adam.py", "test_loss.py", "test_knn.py", "test_correlate.py", "test_proof_poison.py", "test_cpu_input.py",
-    "test_reference_order.py", "test_reference_gsplat.py", "test_cpu_isa.py", FUNCTIONS,
+    "test_cpu_clusters.py", "test_adam.py", "test_loss.py", "test_knn.py", "test_correlate.py", "test_proof_poison.py",
+    "test_cpu_input.py", "test_reference_order.py", "test_reference_gsplat.py", "test_cpu_isa.py", FUNCTIONS,
 ]  # fmt: skip
 ALL_GPU = [
     "test_gpu_step.py", "test_gpu_ops.py", "test_gpu_waiting.py", "test_gpu_records.py", "test_gpu_launches.py",

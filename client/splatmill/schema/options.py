@@ -310,6 +310,15 @@ class TrainOptions(Request):
         ),
         json_schema_extra=_ENGINE,
     )
+    cluster_culling: Switch = Field(
+        default=Switch.auto,
+        description=(
+            "Leave the parts of a large scene that a photo does not show out of the steps on it, which makes them "
+            "faster. With auto, this is done where photos have at most half of the scene in view. Only on the cpu "
+            "backend."
+        ),
+        json_schema_extra=_ENGINE,
+    )
     antialias: Switch = Field(
         default=Switch.auto,
         description=(

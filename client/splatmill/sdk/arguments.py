@@ -47,6 +47,7 @@ class TrainArguments(TypedDict, total=False):
     scale: str | None
     sh_degree: int | None
     densify: Switch | Literal["auto", "on", "off"]
+    cluster_culling: Switch | Literal["auto", "on", "off"]
     antialias: Switch | Literal["auto", "on", "off"]
     backend: Backend | Literal["auto", "reference", "cpu", "gpu"]
     seed: int

@@ -147,7 +147,8 @@ def test_every_two_decisions_run_together(
     outcome, events, changes = run(folder, tmp_path, row)
     assert outcome.ended == "succeeded"
     plan = next(event.plan for event in events if event.type == "plan")
-    for name in ("exposure", "far_shell", "gaps", "pose_refinement", "densify", "antialias"):
+    switches = ("exposure", "far_shell", "gaps", "pose_refinement", "densify", "antialias", "cluster_culling")
+    for name in switches:
         assert plan.get(name, False) is (row[name] == "on"), name
     assert plan["initial"] == row["initial"]
     assert plan["image_size"] == changes["image_size"]

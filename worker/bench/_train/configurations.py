@@ -109,6 +109,10 @@ CONFIGURATIONS = {
     "no-far-shell": _option("no such shell", "far_shell", "off", False),
     "gaps": _option("Gaussians where photos show what no point describes", "gaps", "on", True, points=True),
     "no-gaps": _option("no such Gaussians", "gaps", "off", False),
+    "cluster-culling": _option(
+        "steps leave out clusters of Gaussians out of view", "cluster_culling", "on", True
+    ),
+    "no-cluster-culling": _option("every step computes all Gaussians", "cluster_culling", "off", False),
     "pose-refinement": _option("training cameras are corrected", "pose_refinement", "on", True),
     "no-pose-refinement": _option("cameras stay as they are", "pose_refinement", "off", False),
     "probe-of-the-start": Configuration(

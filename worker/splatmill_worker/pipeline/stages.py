@@ -69,8 +69,10 @@ def run(
         planned = plan_training(job, cameras, revise, stages)
         emit(PlanEvent(plan=planned.plan.as_dict()))
         photos = planned_photos(cameras, planned, stages)
-        engine = open_engine(seeded(planned.first, cameras, photos, planned.plan), planned.plan.kernels)
-        trained, record = train_scene(job, cameras, photos, planned.plan, engine)
+        plan = planned.plan
+        first = seeded(planned.first, cameras, photos, plan)
+        engine = open_engine(first, plan.kernels, clustered=plan.cluster_culling)
+        trained, record = train_scene(job, cameras, photos, plan, engine)
     except Cancelled:
         return Outcome("cancelled", workdir / "out")
     emit(StateEvent(state=JobState.exporting))

@@ -79,7 +79,7 @@ def test_a_thing_is_either_chosen_or_left_out(change: dict[str, Any]) -> None:
     plan = planned(changed(**change))
     assert not set(plan.reasons) & set(plan.left_out)
     told = plan.as_dict()
-    for name in ("far_shell", "gaps", "pose_refinement", "exposure", "antialias"):
+    for name in ("far_shell", "gaps", "pose_refinement", "exposure", "antialias", "cluster_culling"):
         assert (name in told) == (name in plan.reasons) == (name not in plan.left_out)
     for name in ("budget", "schedule", "image_size", "max_gaussians", "initial", "background", "sh_degree"):
         assert name in plan.reasons
@@ -91,6 +91,7 @@ def test_a_thing_is_either_chosen_or_left_out(change: dict[str, Any]) -> None:
         ({"exposure": "on"}, "exposure", True),
         ({"antialias": "on"}, "antialias", True),
         ({"pose_refinement": "on"}, "pose_refinement", True),
+        ({"cluster_culling": "on"}, "cluster_culling", True),
         ({"gaps": "off"}, "gaps", False),
         ({"far_shell": "off"}, "far_shell", False),
         ({"densify": "on"}, "densify", True),

@@ -115,7 +115,7 @@ void bind_bin(nb::module_& m) {
         nb::gil_scoped_release release;
         frame.camera = Camera{};
         frame.camera.width = width, frame.camera.height = height;
-        collect_touches(frame, count, threads, [&](int64_t begin, int64_t end, TouchWriter& writer) {
+        collect_touches(frame, count, blocks_for(count), threads, [&](int64_t begin, int64_t end, TouchWriter& writer) {
           for (int64_t i = begin * kLanes; i < std::min(count, end * kLanes); ++i) {
             if (culled(rows, i)) continue;
             const Record record = record_of(rows, i);

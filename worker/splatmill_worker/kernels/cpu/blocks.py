@@ -26,34 +26,38 @@ def empty(count: int) -> Tensor:
     return blocks
 
 
-def pack(groups: dict[str, Tensor], count: int, threads: int) -> Tensor:
+def pack(groups: dict[str, Tensor], count: int, threads: int, order: Tensor | None = None) -> Tensor:
     """Return blocks that hold the groups [count, ...]; coefficients of sh that are not given are 0.
+
+    order: int64 [count], the row of the groups that each Gaussian of the blocks is; None: the same.
 
     Unused lanes are all 0: with a quaternion of 0 a Gaussian is never visible, and Adam leaves it where it is.
     """
     blocks = empty(count)
     flat = [g.detach().unsqueeze(1).flatten(1).contiguous() for g in groups.values()]
-    engine.pack(flat, [FIRST[name] for name in groups], blocks, count, threads)
+    engine.pack(flat, [FIRST[name] for name in groups], blocks, count, order, threads)
     return blocks
 
 
-def unpack(blocks: Tensor, shapes: dict[str, torch.Size], count: int, threads: int) -> dict[str, Tensor]:
-    """Return the groups in blocks as plain tensors of the given shapes [count, ...]."""
+def unpack(
+    blocks: Tensor, shapes: dict[str, torch.Size], count: int, threads: int, order: Tensor | None = None
+) -> dict[str, Tensor]:
+    """Return the groups in blocks as plain tensors of the given shapes [count, ...]; order as it was packed in."""
     groups = {name: torch.empty(shape) for name, shape in shapes.items()}
     flat = [g.unsqueeze(1).flatten(1) for g in groups.values()]  # views of `groups`
-    engine.unpack(flat, [FIRST[name] for name in groups], blocks, count, threads)
+    engine.unpack(flat, [FIRST[name] for name in groups], blocks, count, order, threads)
     return groups
 
 
-def pack_rows(rows: Tensor, threads: int) -> Tensor:
-    """Return blocks that hold plain rows [N, 59], such as moments."""
+def pack_rows(rows: Tensor, threads: int, order: Tensor | None = None) -> Tensor:
+    """Return blocks that hold plain rows [N, 59], such as moments, in the order that `pack` describes."""
     blocks = empty(len(rows))
-    engine.pack([rows.detach().contiguous()], [0], blocks, len(rows), threads)
+    engine.pack([rows.detach().contiguous()], [0], blocks, len(rows), order, threads)
     return blocks
 
 
-def unpack_rows(blocks: Tensor, count: int, threads: int) -> Tensor:
-    """Return the plain rows [count, 59] of blocks."""
+def unpack_rows(blocks: Tensor, count: int, threads: int, order: Tensor | None = None) -> Tensor:
+    """Return the plain rows [count, 59] of blocks; order as they were packed in."""
     rows = torch.empty(count, PARAMETERS)
-    engine.unpack([rows], [0], blocks, count, threads)
+    engine.unpack([rows], [0], blocks, count, order, threads)
     return rows

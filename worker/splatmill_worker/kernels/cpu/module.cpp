@@ -8,6 +8,7 @@ namespace splatmill {
 
 void bind_adam(nb::module_& m);
 void bind_bin(nb::module_& m);
+void bind_clusters(nb::module_& m);
 void bind_composite(nb::module_& m);
 void bind_correlate(nb::module_& m);
 void bind_knn(nb::module_& m);
@@ -66,6 +67,7 @@ NB_MODULE(SPLATMILL_MODULE, m) {
           "(tile, Gaussian) pairs that there is room for, at 12 bytes each, and at 64 more once gradients were taken.");
   bind_adam(m);
   bind_bin(m);
+  bind_clusters(m);
   bind_composite(m);
   bind_correlate(m);
   bind_knn(m);

@@ -42,10 +42,15 @@ SPLATMILL_INLINE void make_records(const Projection& o, const Float* color, Floa
 
 }  // namespace
 
-void project_frame(const float* blocks, int64_t count, int degree, Frame& frame, int threads) {
+void project_frame(const float* blocks, int64_t count, int degree, Frame& frame, int threads, const Clusters* clusters) {
   const Camera cam = frame.camera;
-  collect_touches(frame, count, threads, [&](int64_t begin, int64_t end, TouchWriter& writer) {
-    for (int64_t b = begin; b < end; ++b) {
+  const Visited visited(count, clusters);
+  const int64_t all = blocks_for(count);
+  frame.visible.reserve(all);
+  if (clusters) std::fill_n(frame.visible.get(), all, uint16_t{0});
+  collect_touches(frame, count, visited.blocks(), threads, [&](int64_t begin, int64_t end, TouchWriter& writer) {
+    for (int64_t i = begin; i < end; ++i) {
+      const int64_t b = visited.block(i);
       const float* p = blocks + b * kParameterFloats;
       uint32_t seen = 0;
       Projection o;

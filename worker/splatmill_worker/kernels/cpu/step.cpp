@@ -4,6 +4,7 @@
 #include "adam.hpp"
 #include "arguments.hpp"
 #include "bin.hpp"
+#include "clusters.hpp"
 #include "composite.hpp"
 #include "geometry.hpp"
 #include "pose.hpp"
@@ -22,6 +23,9 @@ enum Score {
   kScoreRows
 };
 
+// Parameters of a Gaussian that are used at a degree of the spherical harmonics.
+SPLATMILL_INLINE int rows_of(int degree) { return kSh + 3 * (degree + 1) * (degree + 1); }
+
 struct Scene {
   const float* params;
   int degree;
@@ -29,7 +33,7 @@ struct Scene {
 
 // What the pass over blocks writes: moved parameters and moments, or the gradients alone.
 struct Update {
-  float *params = nullptr, *exp_avg = nullptr, *exp_avg_sq = nullptr;
+  State state;
   float rates[kRows] = {};  // with the bias correction of the first moment
   AdamStep adam;            // weights and bias correction of the second moment; its `size` is in `rates` already
   int64_t step = 0;
@@ -85,28 +89,11 @@ SPLATMILL_INLINE void add_scores(const Update& update, const Camera& cam, int64_
   store(at(kExtent), visible, max(max(o.extent_x, o.extent_y) * per_image, load(at(kExtent))));
 }
 
-// Where the rows of a block lie in memory.
-class BlockState {
- public:
-  SPLATMILL_INLINE BlockState(const Update& update, int64_t b)
-      : params_(reinterpret_cast<char*>(update.params + b * kParameterFloats)),
-        exp_avg_(reinterpret_cast<char*>(update.exp_avg) + b * kRows * kLanes * FirstMoment::kBytes),
-        exp_avg_sq_(reinterpret_cast<char*>(update.exp_avg_sq) + b * kRows * kLanes * SecondMoment::kBytes) {}
-  SPLATMILL_INLINE char* param(int r) const {
-    return params_ + kLanes * (r < kSh ? r * 4 : kSh * 4 + (r - kSh) * Harmonics::kBytes);
-  }
-  SPLATMILL_INLINE char* exp_avg(int r) const { return exp_avg_ + r * kLanes * FirstMoment::kBytes; }
-  SPLATMILL_INLINE char* exp_avg_sq(int r) const { return exp_avg_sq_ + r * kLanes * SecondMoment::kBytes; }
-
- private:
-  char *params_, *exp_avg_, *exp_avg_sq_;
-};
-
 // Updates one block; returns how many gradient values Adam refused. With kPose, adds the camera's gradient to `pose`.
 template <bool kAdam, bool kPose>
 int64_t update_block(const Frame& frame, const ImageGradient& g, const Scene& scene, const Update& update, int64_t b,
                      double* pose) {
-  const int rows = kSh + 3 * (scene.degree + 1) * (scene.degree + 1);
+  const int rows = rows_of(scene.degree);
   const float* p = scene.params + b * kParameterFloats;
   const uint32_t seen = frame.visible[b];
   const Mask visible = mask_of(seen);
@@ -130,30 +117,27 @@ int64_t update_block(const Frame& frame, const ImageGradient& g, const Scene& sc
     return 0;
   } else {
     int64_t refused = 0;
-    const BlockState at(update, b);
+    const BlockState at(update.state, b);
     Noise noise(update.step, b);
     for (int r = 0; r < rows; ++r) {
-      Float x = r < kSh ? row(p, r) : sh_row(p, r), m = FirstMoment::load(at.exp_avg(r)), v = SecondMoment::load(at.exp_avg_sq(r));
+      Float x, m, v;
+      at.load(r, x, m, v);
       const Float slope = seen ? keep(visible, load(gradient + r * kLanes)) : splat(0.0f);
       const Mask good = adam_update(x, m, v, slope, splat(update.rates[r]), update.adam);
       refused += kLanes - __builtin_popcount(bits(good));
-      if (r < kSh)
-        Float32::store(at.param(r), x, noise);
-      else
-        Harmonics::store(at.param(r), x, noise);
-      FirstMoment::store(at.exp_avg(r), m, noise);
-      SecondMoment::store(at.exp_avg_sq(r), v, noise);
+      at.store(r, x, m, v, noise);
     }
     return refused;
   }
 }
 
-constexpr int64_t kUpdateChunk = 16;  // blocks that one task updates, and whose camera gradients it adds up
-
-// Updates all blocks. With kPose, writes the sums [kPoseSums] of the camera's gradient to `pose`.
+// Updates all blocks, or with `clusters` those of the chosen ones, of which one task updates one and adds up its camera gradients.
+// With kPose, writes the sums [kPoseSums] of the camera's gradient to `pose`.
 template <bool kAdam, bool kPose>
-int64_t update_scene(Frame& frame, const ImageGradient& g, const Scene& scene, const Update& update, double* pose, int threads) {
-  const int64_t n = blocks_for(frame.count), chunks = (n + kUpdateChunk - 1) / kUpdateChunk;
+int64_t update_scene(Frame& frame, const ImageGradient& g, const Scene& scene, const Update& update, double* pose, int threads,
+                     Clusters* clusters = nullptr) {
+  const Visited visited(frame.count, clusters);
+  const int64_t n = visited.blocks(), chunks = (n + kClusterBlocks - 1) / kClusterBlocks;
   double* partial = kPose ? frame.pose_sums.reserve(chunks * kPoseSums) : nullptr;
   int64_t refused = 0;
 #pragma omp parallel num_threads(threads) reduction(+ : refused)
@@ -163,8 +147,9 @@ int64_t update_scene(Frame& frame, const ImageGradient& g, const Scene& scene, c
     for (int64_t chunk = 0; chunk < chunks; ++chunk) {
       double* sums = kPose ? partial + chunk * kPoseSums : nullptr;
       if constexpr (kPose) std::fill_n(sums, kPoseSums, 0.0);
-      for (int64_t b = chunk * kUpdateChunk; b < std::min(n, (chunk + 1) * kUpdateChunk); ++b)
-        refused += update_block<kAdam, kPose>(frame, g, scene, update, b, sums);
+      for (int64_t i = chunk * kClusterBlocks; i < std::min(n, (chunk + 1) * kClusterBlocks); ++i)
+        refused += update_block<kAdam, kPose>(frame, g, scene, update, visited.block(i), sums);
+      if (clusters) clusters->moved(update.state, clusters->chosen()[chunk]);
     }
   }
   if constexpr (kPose) add_parts(partial, chunks, pose);
@@ -193,13 +178,13 @@ void bind_step(nb::module_& m) {
   m.def(
       "render",
       [](Frame& frame, Blocks params, int64_t count, int degree, const Camera& camera,
-         const std::tuple<float, float, float>& background, Image image, int threads) {
+         const std::tuple<float, float, float>& background, Image image, int threads, const Clusters* clusters) {
         const float rgb[3] = {std::get<0>(background), std::get<1>(background), std::get<2>(background)};
         const bool with_alpha_and_depth = image.shape(0) == 5;
         nb::gil_scoped_release release;
         frame.camera = camera;
         Stopwatch watch;
-        project_frame(params.data(), count, degree, frame, threads);
+        project_frame(params.data(), count, degree, frame, threads, clusters);
         frame.seconds.project = watch.lap();
         bin_frame(frame, threads);
         frame.seconds.bin = watch.lap();
@@ -208,15 +193,16 @@ void bind_step(nb::module_& m) {
         return std::make_tuple(frame.visible_count, frame.pairs);
       },
       "frame"_a, "params"_a.noconvert(), "count"_a, "degree"_a, "camera"_a, "background"_a, "image"_a.noconvert(), "threads"_a,
+      "clusters"_a.none() = nb::none(),
       "Renders blocks of parameters into three planes of colour or, with alpha and depth, five planes; returns the numbers of "
-      "visible Gaussians and of (tile, Gaussian) pairs.");
+      "visible Gaussians and of (tile, Gaussian) pairs. With `clusters`, the others than those chosen last are taken to be out of view.");
   m.def(
       "update",
       [](Frame& frame, Blocks params, Blocks exp_avg, Blocks exp_avg_sq, int degree, Image image, Image gradient,
          const std::vector<float>& rates, double beta2, int64_t step, std::optional<ScoreRows> scores, int threads,
-         std::optional<Twist> pose) {
+         std::optional<Twist> pose, Clusters* clusters) {
         Update update;
-        update.params = params.data(), update.exp_avg = exp_avg.data(), update.exp_avg_sq = exp_avg_sq.data();
+        update.state = {params.data(), exp_avg.data(), exp_avg_sq.data()};
         update.adam = AdamStep(step, beta2);
         for (int r = 0; r < kRows; ++r) update.rates[r] = rates.at(r) * update.adam.size;
         update.step = step;
@@ -227,22 +213,28 @@ void bind_step(nb::module_& m) {
         composite_backward(frame, g, threads);
         frame.seconds.backward = watch.lap();
         const Scene scene{params.data(), degree};
+        if (clusters) {
+          Drift::Sums by_group;
+          for (int rate = 0; rate < kRates; ++rate) by_group[rate] = rates.at(kRateRows[rate]);
+          clusters->advance(update.state, by_group, step, beta2, rows_of(degree), threads);
+        }
         int64_t refused;
         if (pose) {
           double sums[kPoseSums];
-          refused = update_scene<true, true>(frame, g, scene, update, sums, threads);
+          refused = update_scene<true, true>(frame, g, scene, update, sums, threads, clusters);
           motion_gradient(frame.camera, sums, pose->data());
         } else {
-          refused = update_scene<true, false>(frame, g, scene, update, nullptr, threads);
+          refused = update_scene<true, false>(frame, g, scene, update, nullptr, threads, clusters);
         }
         frame.seconds.update = watch.lap();
         return refused;
       },
       "frame"_a, "params"_a.noconvert(), "exp_avg"_a.noconvert(), "exp_avg_sq"_a.noconvert(), "degree"_a,
       "image"_a.noconvert(), "gradient"_a.noconvert(), "rates"_a, "beta2"_a, "step"_a,
-      "scores"_a.noconvert().none(), "threads"_a, "pose"_a.noconvert().none() = nb::none(),
+      "scores"_a.noconvert().none(), "threads"_a, "pose"_a.noconvert().none() = nb::none(), "clusters"_a.none() = nb::none(),
       "Backward pass of the last render and one Adam step; returns how many gradient values were refused as not finite. Adds to "
-      "`scores` [3, Gaussians] and fills `pose` [6] with the gradient to a motion of the camera (pose.hpp), where given.");
+      "`scores` [3, Gaussians] and fills `pose` [6] with the gradient to a motion of the camera (pose.hpp), where given. With "
+      "`clusters`, which `render` was given too, moves those chosen last.");
   m.def(
       "gradients",
       [](Frame& frame, Blocks params, int degree, Image image, Image gradient, Blocks gradients, int threads) {

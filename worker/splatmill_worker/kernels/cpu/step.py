@@ -10,6 +10,7 @@ from torch import Tensor
 from splatmill_worker.kernels import checks
 from splatmill_worker.kernels.records import PARAMETERS, TILE, Rates
 
+from ..morton import morton_order
 from . import blocks, engine
 from .loss import PhotoStats, photo_stats
 
@@ -46,15 +47,18 @@ class StepResult(NamedTuple):
 class Step:
     """Parameters, Adam moments and densification scores of one scene on the CPU, and the training step over them.
 
-    Adam is dense: every step moves every Gaussian, those that were not in view by their moments. Not for use from two
-    threads at once.
+    Adam is dense: every step moves every Gaussian, those that were not in view by their moments. With `clustered`,
+    steps leave out the clusters of 256 neighbours that cannot be in view; these make up for what they missed when they
+    may be in view again, or are read. Not for use from two threads at once.
 
     threads: how many the passes use; results do not depend on it.
+    clustered: whether steps leave out clusters that are not in view. To be changed before a `replace`.
     count: number of Gaussians.
     keep_scores: whether steps add to the densification scores.
     visibility: what the last rendering counted.
     pose_gradient: the camera's gradient of the last update; see `backward_update`.
-    blocks, exp_avg, exp_avg_sq: parameters and moments, float32 [ceil(N/16), 59, 16] (`blocks`).
+    blocks, exp_avg, exp_avg_sq: parameters and moments, float32 [ceil(N/16), 59, 16] (`blocks`); with `clustered`, in
+        an order of their own, and without the steps missed.
     """
 
     def __init__(
@@ -66,6 +70,7 @@ class Step:
         sh: Tensor,
         *,
         threads: int | None = None,
+        clustered: bool = False,
     ) -> None:
         """Take means [N,3], log_scales [N,3], quats [N,4], logit_opacities [N] and sh [N,16,3], float32 on the CPU.
 
@@ -75,6 +80,7 @@ class Step:
         self.threads = threads or engine.default_threads()
         if self.threads < 1:
             raise ValueError(f"threads: expected at least 1, got {threads}")
+        self.clustered = clustered
         self.keep_scores = True
         self._frame = engine.Frame()
         self._image = torch.zeros(0)
@@ -109,16 +115,22 @@ class Step:
             if moment is not None:
                 checks.tensor(name, moment, (count, PARAMETERS))
         self.count = count
-        self.blocks = blocks.pack(ordered, count, self.threads)
-        self.exp_avg = blocks.empty(count) if exp_avg is None else blocks.pack_rows(exp_avg, self.threads)
-        self.exp_avg_sq = (
-            blocks.empty(count) if exp_avg_sq is None else blocks.pack_rows(exp_avg_sq, self.threads)
+        means = ordered["means"].detach()
+        order = self._order = (
+            morton_order(means.nan_to_num(0.0, 0.0, 0.0), cubic=True) if self.clustered else None
         )
+        self.blocks = blocks.pack(ordered, count, self.threads, order)
+        self.exp_avg, self.exp_avg_sq = (
+            blocks.empty(count) if moment is None else blocks.pack_rows(moment, self.threads, order)
+            for moment in (exp_avg, exp_avg_sq)
+        )
+        self._clusters = engine.Clusters(*self._state, count, self.threads) if self.clustered else None
         self._scores = torch.zeros(3, len(self.blocks) * blocks.LANES)
         self._rendered = False
 
     def parameters(self) -> dict[str, Tensor]:
         """Return copies of the parameters, [N, ...] each, under the names of the constructor."""
+        self._settle()
         n = self.count
         shapes = {
             "means": (n, 3),
@@ -127,37 +139,57 @@ class Step:
             "logit_opacities": (n,),
             "sh": (n, 16, 3),
         }
-        return blocks.unpack(self.blocks, {k: torch.Size(s) for k, s in shapes.items()}, n, self.threads)
+        sizes = {k: torch.Size(s) for k, s in shapes.items()}
+        return blocks.unpack(self.blocks, sizes, n, self.threads, self._order)
 
     def moments(self) -> tuple[Tensor, Tensor]:
         """Return copies of Adam's first and second moments, [N, 59] each; columns in the order of `records.GROUPS`."""
+        self._settle()
         return (
-            blocks.unpack_rows(self.exp_avg, self.count, self.threads),
-            blocks.unpack_rows(self.exp_avg_sq, self.count, self.threads),
+            blocks.unpack_rows(self.exp_avg, self.count, self.threads, self._order),
+            blocks.unpack_rows(self.exp_avg_sq, self.count, self.threads, self._order),
         )
+
+    @property
+    def share_computed(self) -> float:
+        """Share of the clusters that the last rendering computed; 1 without `clustered`."""
+        return 1.0 if self._clusters is None else len(self._clusters.chosen) / max(1, self._clusters.count)
+
+    @property
+    def _state(self) -> tuple[Tensor, Tensor, Tensor]:
+        return self.blocks, self.exp_avg, self.exp_avg_sq
+
+    def _settle(self) -> None:
+        """Bring every Gaussian to where dense Adam has it."""
+        if self._clusters is not None:
+            self._clusters.settle(*self._state, self.threads)
 
     @property
     def logit_opacities(self) -> Tensor:
         """View [blocks, 16] of the logits of the opacities, to be written to between steps."""
         return self.blocks[:, blocks.FIRST["logit_opacities"], :]
 
-    # Densification scores: views [N] that add up over steps until `replace` or `clear_scores`. The norm of the gradient
-    # is in NDC units (the image is 2 wide and 2 high), as published thresholds are.
+    # Densification scores [N], views but with `clustered`, that add up over steps until `replace` or `clear_scores`.
+    # The norm of the gradient is in NDC units (the image is 2 wide and 2 high), as published thresholds are.
 
     @property
     def plain_sum(self) -> Tensor:
         """Sum over views of |dL/d mean2d| in NDC units (Kerbl et al. 2023)."""
-        return self._scores[0, : self.count]
+        return self._score(0)
 
     @property
     def visible_count(self) -> Tensor:
         """Number of views in which the Gaussian reached a 4x4-pixel block of the image."""
-        return self._scores[1, : self.count]
+        return self._score(1)
 
     @property
     def max_extent(self) -> Tensor:
         """Largest half side, over views, of the box around the 1/255 ellipse, over half the image's longer side."""
-        return self._scores[2, : self.count]
+        return self._score(2)
+
+    def _score(self, number: int) -> Tensor:
+        score = self._scores[number, : self.count]
+        return score if self._order is None else torch.empty_like(score).index_copy_(0, self._order, score)
 
     def clear_scores(self) -> None:
         """Set the scores to 0."""
@@ -217,7 +249,7 @@ class Step:
         out = torch.empty_like(self.blocks)
         engine.gradients(self._frame, self.blocks, self._degree, self._image, gradient, out, self.threads)
         shapes = {name: value.shape for name, value in self.parameters().items()}
-        return blocks.unpack(out, shapes, self.count, self.threads)
+        return blocks.unpack(out, shapes, self.count, self.threads, self._order)
 
     def train(
         self,
@@ -280,8 +312,18 @@ class Step:
             self._image, self._gradient = torch.zeros(shape), torch.zeros(shape)
         camera = engine.Camera(viewmat.contiguous(), K.contiguous(), width, height, near, antialias)
         color = (0.0, 0.0, 0.0) if background is None else tuple(background.tolist())
+        if self._clusters is not None:
+            self._clusters.choose(*self._state, camera, self.threads)
         seen = engine.render(
-            self._frame, self.blocks, self.count, degree, camera, color, self._image, self.threads
+            self._frame,
+            self.blocks,
+            self.count,
+            degree,
+            camera,
+            color,
+            self._image,
+            self.threads,
+            self._clusters,
         )
         self.visibility = Visibility(*seen)
         self._degree, self._size, self._rendered = degree, (height, width), True
@@ -322,6 +364,7 @@ class Step:
             self._scores if self.keep_scores else None,
             self.threads,
             self.pose_gradient,
+            self._clusters,
         )
         self._rendered = False  # the rendering shows the Gaussians before they moved
         return refused

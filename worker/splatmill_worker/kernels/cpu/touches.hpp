@@ -89,18 +89,16 @@ inline void grow_rooms(Frame& frame, const std::vector<int64_t>& wanted, int64_t
   for (int64_t t = 0; t < threads; ++t) frame.rooms[t] = std::max(least, wanted[t] + wanted[t] / 4);
 }
 
-// Runs visit(begin, end, writer) over all blocks of sixteen Gaussians, divided among the threads, and closes the gaps between the
-// threads' Gaussians. Repeats with more room when a stretch overflowed. Throws TooManyPairs.
+// Runs visit(begin, end, writer) over `n` blocks of sixteen of the `count` Gaussians, divided among the threads, and closes the
+// gaps between the threads' Gaussians. Repeats with more room when a stretch overflowed. Throws TooManyPairs.
 template <class Visit>
-void collect_touches(Frame& frame, int64_t count, int threads, Visit visit) {
-  const int64_t n = blocks_for(count);
+void collect_touches(Frame& frame, int64_t count, int64_t n, int threads, Visit visit) {
   frame.count = count;
-  frame.records.reserve(n * kLanes);
-  frame.visible.reserve(n);
-  frame.spans.reserve(n * kLanes);
+  frame.records.reserve(blocks_for(count) * kLanes);
+  frame.spans.reserve(blocks_for(count) * kLanes);
   for (auto* buffer : {&frame.order, &frame.order_swap}) buffer->reserve(n * kLanes);
   for (auto* buffer : {&frame.keys, &frame.keys_swap}) buffer->reserve(n * kLanes);
-  const int64_t least = std::max<int64_t>(2 * count / threads, 4096);
+  const int64_t least = std::max<int64_t>(2 * std::min(count, n * kLanes) / threads, 4096);
   frame.rooms.resize(threads);
   for (int64_t& room : frame.rooms) room = std::max(room, least);
 

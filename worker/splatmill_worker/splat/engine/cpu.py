@@ -18,10 +18,13 @@ KEPT_BYTES = 400 * 10**6
 
 
 class CpuEngine(Step):
-    """An Engine on the C++ kernels, with as many threads as the kernels choose where `threads` is None."""
+    """An Engine on the C++ kernels, with as many threads as the kernels choose where `threads` is None.
 
-    def __init__(self, gaussians: Gaussians, *, threads: int | None = None) -> None:
-        super().__init__(**gaussians.padded(3).parameters(), threads=threads)
+    clustered: as in `Step`.
+    """
+
+    def __init__(self, gaussians: Gaussians, *, threads: int | None = None, clustered: bool = False) -> None:
+        super().__init__(**gaussians.padded(3).parameters(), threads=threads, clustered=clustered)
         self.keep_pose_gradient = False
         self._kept: dict[Hashable, PhotoStats] = {}
         self._kept_bytes = 0

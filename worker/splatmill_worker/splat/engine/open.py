@@ -9,10 +9,15 @@ from splatmill_worker.splat.engine.protocol import Engine
 from splatmill_worker.splat.gaussians import Gaussians
 
 
-def open_engine(gaussians: Gaussians, kernels: ops.Backend) -> Engine:
-    """The engine of a backend, holding `gaussians`: the fused step on cpu and gpu, autograd on reference."""
+def open_engine(gaussians: Gaussians, kernels: ops.Backend, *, clustered: bool = False) -> Engine:
+    """The engine of a backend, holding `gaussians`: the fused step on cpu and gpu, autograd on reference.
+
+    clustered: steps leave out clusters of Gaussians that are not in view; for cpu alone.
+    """
+    if clustered and kernels != "cpu":
+        raise ValueError(f"clustered: the {kernels} engine computes all Gaussians at every step")
     if kernels == "cpu":
-        return CpuEngine(gaussians)
+        return CpuEngine(gaussians, clustered=clustered)
     if kernels == "gpu":
         from splatmill_worker.splat.engine.gpu import GpuEngine
 

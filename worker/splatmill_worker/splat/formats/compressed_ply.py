@@ -19,6 +19,7 @@ from torch import Tensor
 
 from splatmill.files import atomic_write
 from splatmill_worker.errors import ModelUnreadable
+from splatmill_worker.kernels.morton import morton_order
 from splatmill_worker.splat.formats import ply, ply_columns, ply_comments
 from splatmill_worker.splat.formats.contents import (
     MIN_OPACITY,
@@ -28,7 +29,6 @@ from splatmill_worker.splat.formats.contents import (
     finite,
     logits,
 )
-from splatmill_worker.splat.formats.morton import morton_order
 from splatmill_worker.splat.gaussians import SH_C0, Gaussians
 
 CHUNK = 256

@@ -26,6 +26,7 @@ from splatmill.files import replacing
 from splatmill_worker.errors import ModelUnreadable, UnusablePicture
 from splatmill_worker.images import guarded
 from splatmill_worker.images.archives.archive import DAMAGED
+from splatmill_worker.kernels.morton import morton_order
 from splatmill_worker.readers.reader_memory import check_gaussians
 from splatmill_worker.splat.formats import palette, sog_files
 from splatmill_worker.splat.formats.contents import (
@@ -37,7 +38,6 @@ from splatmill_worker.splat.formats.contents import (
     unit,
     visible,
 )
-from splatmill_worker.splat.formats.morton import morton_order
 from splatmill_worker.splat.gaussians import REST_COEFFICIENTS, Gaussians
 from splatmill_worker.wording import plain
 

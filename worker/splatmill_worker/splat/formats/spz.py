@@ -20,11 +20,11 @@ from torch import Tensor
 
 from splatmill.files import atomic_write
 from splatmill_worker.errors import ModelUnreadable
+from splatmill_worker.kernels.morton import morton_order
 from splatmill_worker.readers.reader_memory import check, check_gaussians
 from splatmill_worker.splat.formats.contents import NO_OFFSET, Contents, Offset, finite, logits, unit, visible
 from splatmill_worker.splat.formats.expansion import Gunzip, unzstd
 from splatmill_worker.splat.formats.frames import turned_about_x
-from splatmill_worker.splat.formats.morton import morton_order
 from splatmill_worker.splat.formats.ply_columns import rest_notes
 from splatmill_worker.splat.gaussians import Gaussians
 

@@ -7,6 +7,7 @@ from typing import Any, Literal
 from splatmill.schema import Background, TrainOptions
 from splatmill_worker.kernels.records import BETA2
 from splatmill_worker.splat.plan.capacity import decide_capacity, decide_densification
+from splatmill_worker.splat.plan.culling import decide_culling
 from splatmill_worker.splat.plan.facts import Facts
 from splatmill_worker.splat.plan.needs import FEW_VIEWS, needs_of
 from splatmill_worker.splat.plan.photos import (
@@ -56,6 +57,7 @@ def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
         "gaps": needs.gaps,
         "pose_refinement": needs.pose_refinement,
         "max_gaussians": capacity.max_gaussians,
+        "cluster_culling": (culling := decide_culling(facts, options, kernels, most)),
         "budget": capacity.budget,
         "schedule": capacity.steps,
         "densify": (densify := decide_densification(options, most, initial=initial)),
@@ -103,6 +105,7 @@ def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
         far_shell=needs.far_shell.value,
         gaps=needs.gaps.value,
         pose_refinement=needs.pose_refinement.value,
+        cluster_culling=culling.value,
         validation=validation.value,
         least_gain=gain or 0.0,
         reasons=explanation.chosen,

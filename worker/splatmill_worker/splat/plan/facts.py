@@ -15,7 +15,7 @@ from splatmill_worker import memory
 from splatmill_worker.images.lens import distortion
 from splatmill_worker.scene import Scene
 from splatmill_worker.splat.plan.light import Light, compared
-from splatmill_worker.splat.plan.observations import Observations
+from splatmill_worker.splat.plan.observations import MAX_POINTS, Observations
 from splatmill_worker.splat.start.cells import cells_of
 from splatmill_worker.splat.start.far_shell import shell_points
 from splatmill_worker.splat.start.gaps import gap_points, gap_share
@@ -25,6 +25,9 @@ from splatmill_worker.splat.start.sky import sky_share
 from splatmill_worker.splat.views import TrainingView
 
 Float = npt.NDArray[np.float64]
+
+SOME_VIEWS = 50
+"""Photos, evenly chosen, that are enough for the median of what photos have in view."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +63,7 @@ class Coverage:
     """Which part of the photos' area shows points.
 
     sightings: median number of points that a photo shows.
+    in_view: share of the points within a photo's frame, whether hidden or not: the median over photos, 0 to 1.
     sky_share: share of the photos' area that looks like sky and shows no point, 0 to 1.
     gap_share: share of the photos' area, sky excluded, with no point in or beside it, 0 to 1.
     gap_points: number of Gaussians that would fill the gaps.
@@ -69,6 +73,7 @@ class Coverage:
     """
 
     sightings: float
+    in_view: float
     sky_share: float
     gap_share: float
     gap_points: int
@@ -216,6 +221,7 @@ def _coverage(scene: Scene, views: Sequence[TrainingView]) -> Coverage | None:
     shell, _ = shell_points(cells, scene.points)
     return Coverage(
         sightings=float(np.median([len(grid.points) for grid in cells])),
+        in_view=_in_view(scene, views),
         sky_share=sky_share(cells),
         gap_share=gap_share(cells),
         gap_points=len(gap_points(cells)[0]),
@@ -223,6 +229,13 @@ def _coverage(scene: Scene, views: Sequence[TrainingView]) -> Coverage | None:
         shell_distance=float(np.linalg.norm(shell, axis=1).min()) if len(shell) else None,
         extent=_extent(scene, views),
     )
+
+
+def _in_view(scene: Scene, views: Sequence[TrainingView]) -> float:
+    """Median, over up to twice SOME_VIEWS photos, of the share of up to twice MAX_POINTS points within their frames."""
+    points = scene.points[:: max(1, len(scene.points) // MAX_POINTS)]
+    some = views[:: max(1, len(views) // SOME_VIEWS)]
+    return float(np.median([view.full.camera.project(points).inside.mean() for view in some]))
 
 
 def _extent(scene: Scene, views: Sequence[TrainingView]) -> float:

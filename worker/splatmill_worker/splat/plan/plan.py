@@ -40,6 +40,7 @@ class Plan:
     far_shell: Gaussians stand behind the scene, wherever photos look.
     gaps: Gaussians are added where photos show something that no point describes.
     pose_refinement: the cameras of training photos are corrected.
+    cluster_culling: steps leave out clusters of Gaussians that the photo does not show.
     validation: number of training photos that are set aside for `target_psnr` and `stops_when_flat`; None: neither.
     least_gain: dB, for `stops_when_flat`; 0 where training ends only once it over-fits.
     reasons: a sentence for each field of the plan.
@@ -63,6 +64,7 @@ class Plan:
     far_shell: bool = False
     gaps: bool = False
     pose_refinement: bool = False
+    cluster_culling: bool = False
     validation: int | None = None
     least_gain: float = 0.02
     reasons: dict[str, str] = field(default_factory=dict)

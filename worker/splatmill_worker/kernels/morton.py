@@ -1,4 +1,4 @@
-"""Orders points along a space-filling curve (Morton 1966): neighbours in a file are neighbours in space."""
+"""Orders points along a space-filling curve (Morton 1966): neighbours in the order are neighbours in space."""
 
 from __future__ import annotations
 
@@ -12,12 +12,16 @@ _SPREAD = ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00
            (2, 0x1249249249249249))  # fmt: skip
 
 
-def morton_order(points: Tensor) -> Tensor:
-    """Indices, int64 [N], that sort finite `points` [N, 3] along the curve through their bounding box."""
+def morton_order(points: Tensor, *, cubic: bool = False) -> Tensor:
+    """Indices, int64 [N], that sort finite `points` [N, 3] along the curve through their bounding box.
+
+    cubic: through the cube that holds the box, so that runs of points are as wide as they are long in a long scene too.
+    """
     if not len(points):
         return torch.zeros(0, dtype=torch.int64)
     low, high = torch.aminmax(points, dim=0)
-    cells = ((points - low) / (high - low).clamp(min=1e-30) * ((1 << BITS) - 1)).to(torch.int64)
+    side = (high - low).clamp(min=1e-30)
+    cells = ((points - low) / (side.max() if cubic else side) * ((1 << BITS) - 1)).to(torch.int64)
     for shift, mask in _SPREAD:
         cells = (cells | (cells << shift)) & mask
     x, y, z = cells.unbind(dim=1)
