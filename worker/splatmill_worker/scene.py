@@ -305,7 +305,7 @@ def split(scene: Scene, holdout: int = 8) -> tuple[tuple[View, ...], tuple[View,
     """Training views and held-out views.
 
     Where the data set names test views, those are held out. Else every `holdout`-th view in order of the names is held
-    out, from the first one on; of fewer than two views, none is. With a `holdout` of 0 none is held out, and the test
+    out, from the first one on; of fewer than three views, none is. With a `holdout` of 0 none is held out, and the test
     views of a data set are left out of both. Raises ValueError when `holdout` is negative, and when it would
     hold out every view.
     """
@@ -317,7 +317,7 @@ def split(scene: Scene, holdout: int = 8) -> tuple[tuple[View, ...], tuple[View,
     own = [view for view in views if view.split == "test"]
     if own and holdout:
         return tuple(view for view in views if view.split != "test"), tuple(own)
-    if holdout == 0 or len(views) < 2:
+    if holdout == 0 or len(views) < 3:
         return tuple(view for view in views if view.split != "test"), ()
     if holdout == 1:
         raise ValueError("holdout is 1, which holds out every view; give 2 or more, or 0 to hold out none.")

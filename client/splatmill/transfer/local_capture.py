@@ -20,7 +20,7 @@ from splatmill.data_sets import (
 )
 from splatmill.errors import NothingToUpload
 from splatmill.schema.files.masks import masks_beside, without_mask_folder
-from splatmill.schema.files.names import UnsafeName, safe_name, storable_name
+from splatmill.schema.files.names import UnsafeName, readings, safe_name, storable_name
 from splatmill.schema.files.other_pictures import beside_photos, kind_of_folder, no_photos
 from splatmill.schema.files.other_pictures import remarks as other_remarks
 from splatmill.schema.files.outputs import own_outputs
@@ -366,13 +366,13 @@ def _documents(root: Path, cameras: Cameras) -> list[dict[str, Any]]:
 
 
 def _named(documents: Iterable[Mapping[str, Any]], key: str, top: str) -> set[str]:
-    """The files that transforms files or their frames name under `key`."""
+    """The paths that the names under `key` in transforms files or their frames may stand for."""
     entries: list[Any] = []
     for document in documents:
         frames = document.get("frames")
         entries += [document, *(frames if isinstance(frames, list) else [])]
     named = [entry[key] for entry in entries if isinstance(entry, dict) and isinstance(entry.get(key), str)]
-    return {top + name.replace("\\", "/").removeprefix("./") for name in named}
+    return {top + path for name in named for path in readings(name)}
 
 
 def _local(role: Role, name: str, path: Path) -> LocalFile:

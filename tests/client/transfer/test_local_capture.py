@@ -223,9 +223,13 @@ def test_links_are_followed_but_not_in_circles(tmp_path: Path):
         '\ufeff{"ply_file_path": ".\\\\points3D.ply"}',
     ],
 )
-def test_the_points_that_transforms_name_are_poses_and_other_files_are_not(tmp_path: Path, content: str):
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16", "utf-16-be", "utf-32"])
+def test_the_points_that_transforms_name_are_poses_and_other_files_are_not(
+    tmp_path: Path, content: str, encoding: str
+):
     tree(tmp_path, "images/a.jpg", "points3D.ply", "other.ply")
-    (tmp_path / "transforms.json").write_text(content)
+    content = content if encoding == "utf-8" else content.removeprefix("\ufeff")
+    (tmp_path / "transforms.json").write_text(content, encoding)
     assert roles(tmp_path)[Role.poses] == ["points3D.ply", "transforms.json"]
 
 
@@ -246,10 +250,11 @@ def test_transforms_without_such_points_are_sent_alone(tmp_path: Path, content: 
         (".\\\\sam\\\\obj_0.png", "sam/obj_0.png"),
         ("masks/obj_0.png", "obj_0.png"),
         ("images/obj_0.png", "obj_0.png"),
+        ("my%20sam/obj%200.png", "my sam/obj 0.png"),
     ],
 )
 def test_the_masks_that_frames_name_are_masks(tmp_path: Path, named: str, stored: str):
-    path = named.replace("\\\\", "/").removeprefix("./")
+    path = named.replace("\\\\", "/").removeprefix("./").replace("%20", " ")
     tree(tmp_path, "images/a.jpg", path, "sam/other.png")
     (tmp_path / "transforms.json").write_text(
         f'{{"frames": [null, {{"file_path": "images/a.jpg", "mask_path": "{named}"}}]}}'

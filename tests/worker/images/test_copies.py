@@ -95,6 +95,16 @@ def test_a_copy_is_found_and_the_original_is_kept(change: Change) -> None:
     assert copies(pictures) == {k: k + 6 for k in range(6)}
 
 
+@pytest.mark.parametrize("stops", [(2.0, 0.0, -3.0), (-3.0, 2.0, 0.0), (1.5, 0.0)])
+def test_of_an_exposure_series_the_photo_with_the_fewest_clipped_pixels_is_kept(
+    stops: tuple[float, ...],
+) -> None:
+    """In whatever order the exposures were taken."""
+    series = [small(exposed(stop)(photos()[0]), f"{k}.jpg") for k, stop in enumerate(stops)]
+    best = stops.index(0.0)
+    assert copies(series) == {k: best for k in range(len(stops)) if k != best}
+
+
 def test_photos_from_other_sides_are_no_copies() -> None:
     assert copies([small(photo, f"{k}.jpg") for k, photo in enumerate(photos())]) == {}
 

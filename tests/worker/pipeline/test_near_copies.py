@@ -132,6 +132,38 @@ def test_one_copy_with_a_given_camera_is_found_by_its_content(
     assert f"{copy.name}, a copy of {view.name}" in parts.warnings[0]
 
 
+def test_of_an_exposure_series_with_cameras_the_photo_with_the_fewest_clipped_pixels_is_kept(
+    scene: Scene, tmp_path: Path
+) -> None:
+    """Those that come before it in order of name are longer or shorter exposures."""
+    series = []
+    for index, stops in enumerate((2.0, -3.0)):
+        copy = replace(scene.views[3], name=f"02_{index}.png", image=tmp_path / f"02_{index}.png")
+        exposed(stops)(Image.open(scene.views[3].image).convert("RGB")).save(copy.image)
+        series.append(copy)
+    parts = honest_split(replace(scene, views=(*series, *scene.views), point_views=None), OPTIONS)
+    assert parts.left_out == tuple((copy.name, "it shows the same as 03.png") for copy in series)
+
+
+@pytest.mark.parametrize(("count", "trained", "held"), [(1, 1, 0), (2, 2, 0), (3, 2, 1), (4, 3, 1)])
+def test_few_photos_are_a_warning_and_of_two_none_is_held_out(
+    scene: Scene, count: int, trained: int, held: int
+) -> None:
+    parts = honest_split(replace(scene, views=scene.views[:count], point_views=None), OPTIONS)
+    assert (len(parts.training), len(parts.held_out)) == (trained, held)
+    said = [warning for warning in parts.warnings if "trained on" in warning]
+    assert bool(said) == (trained < 3)
+    assert all(f"Only {trained} photo" in warning and "Give more photos" in warning for warning in said)
+
+
+def test_few_photos_that_a_split_leaves_are_a_warning(scene: Scene) -> None:
+    held = TrainOptions(test_views=tuple(names(scene.views[1:])))
+    parts = honest_split(scene, held)
+    assert len(parts.training) == 1
+    assert "Only 1 photo is trained on" in parts.warnings[-1]
+    assert "hold out fewer" in parts.warnings[-1]
+
+
 @pytest.mark.parametrize("held", ["00.png", "copy.png"])
 def test_a_brighter_copy_across_a_given_split_is_not_trained_on(
     scene: Scene, tmp_path: Path, held: str

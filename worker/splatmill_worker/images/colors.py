@@ -13,20 +13,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 Values = npt.NDArray[np.float64]
-Table = npt.NDArray[np.float32]
-Pixels = npt.NDArray[np.uint8]
+Light = npt.NDArray[np.float32]
+Real = npt.NDArray[np.floating[Any]]
+Pixels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 
-SIDE = 64
-"""Entries along each side of a table of colours: that of a Hald picture of level 8, and at most 65 for Pillow."""
+BLOCK = 2**15
+"""Pixels that are converted at a time: their light stays in the cache of a core."""
 
-BLOCK = 2**18
-"""Pixels that are converted at a time, which bounds the memory."""
+STEPS = 2**16
+"""Steps of linear light for which the encoded values are kept: in the dark, twenty of them are one level of 255."""
 
 KNEE = 0.83
 """Linear light, of reference white, above which HDR highlights are compressed: the brightest patch of a grey scale
@@ -112,49 +113,53 @@ _PRIMARIES = {
 """Chromaticities x, y of red, green and blue; white is D65."""
 
 
-@lru_cache(maxsize=4)
-def srgb_table(colors: Colors, white: float = 1.0) -> Table:
-    """The sRGB values, 0 to 1, of the values i / (SIDE - 1), as [blue, green, red, 3]; `white` is the largest one."""
-    steps = np.minimum(np.linspace(0.0, 1.0 / white, SIDE), 1.0)
-    blue, green, red = np.meshgrid(steps, steps, steps, indexing="ij")
-    return srgb(np.stack([red, green, blue], axis=-1), colors).astype(np.float32)
-
-
 def srgb(values: Values, colors: Colors) -> Values:
     """Values [...,3] from 0 to 1 of `colors`, as sRGB values from 0 to 1."""
-    return _of_light(_linear(values, colors.transfer), colors)
+    light = _linear(values, colors.transfer)
+    return _encoded(_shown(light.reshape(-1, 3), colors).clip(0.0, 1.0)).reshape(light.shape)
 
 
-def srgb_pixels(pixels: Pixels, colors: Colors) -> Pixels:
-    """Pixels [H,W,3] of 8 bits per channel of `colors`, as those of sRGB, by the rule itself.
+def srgb_pixels(pixels: Pixels, colors: Colors, white: float = 1.0) -> npt.NDArray[np.uint8]:
+    """Pixels [H,W,3] of 8 or 16 bits per channel of `colors`, as those of sRGB of 8 bits: `srgb`, rounded.
 
-    Of HDR, a table of colours would be off by up to 30 levels: between its entries, bright colours differ too much.
+    Each pixel is computed: a table of colours with interpolation is off by up to 30 levels for HDR and 16 for SDR with
+    wide primaries, since the rule bends between its entries.
+
+    white: the largest value of the pixels over that of their type.
     """
-    light = _linear(np.arange(256) / 255.0, colors.transfer)
-    converted = np.empty_like(pixels)
-    rows = max(1, BLOCK // pixels.shape[1])
-    for first in range(0, len(pixels), rows):
-        block = slice(first, first + rows)
-        converted[block] = np.rint(_of_light(light[pixels[block]], colors) * 255.0)
-    return converted
+    light = _light(colors.transfer, np.iinfo(pixels.dtype).max, white)
+    encoded = _encoded_steps()
+    values = np.ascontiguousarray(pixels).reshape(-1, 3)
+    converted = np.empty(values.shape, np.uint8)
+    for first in range(0, len(values), BLOCK):
+        block = slice(first, first + BLOCK)
+        shown = _shown(light[values[block]], colors).clip(0.0, 1.0)
+        converted[block] = encoded[(shown * np.float32(STEPS) + np.float32(0.5)).astype(np.int32)]
+    return converted.reshape(pixels.shape)
 
 
-def _of_light(light: Values, colors: Colors) -> Values:
-    """Light [...,3] of `colors`, of white or of reference white, as sRGB values from 0 to 1."""
-    light = light @ _to_srgb(colors.primaries).T
-    luminance = light @ _rgb_to_xyz("sRGB")[1]
-    least = light.min(axis=-1)
-    outside = least < 0.0
-    kept = np.where(outside, luminance.clip(0.0) / np.where(outside, luminance.clip(0.0) - least, 1.0), 1.0)
-    light = luminance.clip(0.0)[..., None] * (1.0 - kept[..., None]) + light * kept[..., None]
-    largest = light.max(axis=-1, keepdims=True)
-    light = light * np.where(largest > 0.0, _limited(largest, colors.hdr) / np.maximum(largest, 1e-12), 0.0)
-    return _encoded(light.clip(0.0, 1.0))
+@lru_cache(maxsize=4)
+def _light(transfer: str, largest: int, white: float) -> Light:
+    """The light of each value of pixels up to `largest`."""
+    return _linear(np.minimum(np.arange(largest + 1) / (largest * white), 1.0), transfer).astype(np.float32)
 
 
-def with_srgb_transfer(values: Values, transfer: str) -> Values:
-    """Values from 0 to 1 of a transfer function as those of sRGB's, with the same primaries."""
-    return _encoded(_linear(values, transfer).clip(0.0, 1.0))
+@lru_cache(maxsize=1)
+def _encoded_steps() -> npt.NDArray[np.uint8]:
+    """The sRGB levels of STEPS + 1 values of light from 0 to 1."""
+    return np.rint(_encoded(np.arange(STEPS + 1) / STEPS) * 255.0).astype(np.uint8)
+
+
+def _shown(light: Real, colors: Colors) -> Real:
+    """Light [N,3] of `colors`, of white or of reference white, as light of sRGB; rounding may leave it below 0."""
+    light = light @ _to_srgb(colors.primaries).T.astype(light.dtype)
+    luminance = (light @ _rgb_to_xyz("sRGB")[1].astype(light.dtype)).clip(0.0)[:, None]
+    least = light.min(axis=1, keepdims=True)
+    kept = np.where(least < 0.0, luminance / np.maximum(luminance - least, 1e-12), 1.0)
+    light = luminance + (light - luminance) * kept
+    largest = light.max(axis=1, keepdims=True)
+    shown: Real = light * (_limited(largest, colors.hdr) / np.maximum(largest, 1e-12))
+    return shown
 
 
 def _encoded(light: Values) -> Values:
@@ -171,12 +176,13 @@ def _linear(values: Values, transfer: str) -> Values:
     return power
 
 
-def _limited(light: Values, hdr: bool) -> Values:
+def _limited(light: Real, hdr: bool) -> Real:
     """Light, of reference white, in 0 to 1: cut off, or of HDR compressed above KNEE, with slope 1 there, towards 1."""
     if not hdr:
         return np.minimum(light, 1.0)
     above = np.maximum(light - KNEE, 0.0) / (1.0 - KNEE)
-    return np.minimum(light, KNEE) + (1.0 - KNEE) * above / (1.0 + above)
+    limited: Real = np.minimum(light, KNEE) + (1.0 - KNEE) * above / (1.0 + above)
+    return limited
 
 
 def _from_srgb(values: Values) -> Values:

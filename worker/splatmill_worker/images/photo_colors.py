@@ -15,20 +15,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image, ImageCms, ImageFilter
+from PIL import Image, ImageCms
 
 from splatmill_worker.images import guarded
 from splatmill_worker.images.colors import (
     ADOBE_RGB,
     PRIMARIES,
-    SIDE,
     SRGB,
     SRGB_GAMMA,
     TRANSFERS,
     Colors,
     srgb_pixels,
-    srgb_table,
-    with_srgb_transfer,
 )
 
 INTEROPERABILITY_IFD, INTEROPERABILITY_INDEX = 0xA005, 1
@@ -136,19 +133,10 @@ class PhotoColors:
             return _by_profile(self.profile, photo, mode or photo.mode)
         if self.tags == SRGB:
             return photo
-        if photo.mode not in ("RGB", "RGBA"):
-            photo = photo.convert("RGB")
-        colors = self.tags
-        if colors.hdr:
-            converted = Image.fromarray(srgb_pixels(np.asarray(photo.convert("RGB")), colors))
-            if photo.mode == "RGBA":
-                converted.putalpha(photo.getchannel("A"))
-            return converted
-        if colors.transfer != "sRGB":
-            # A curve has an entry for each value, which the table of colours has not.
-            photo = photo.point(_curve(colors.transfer) * 3 + list(range(256)) * (len(photo.mode) - 3))
-            colors = Colors(colors.primaries, "sRGB")
-        return photo if colors == SRGB else photo.filter(_lookup(colors))
+        converted = Image.fromarray(srgb_pixels(np.asarray(photo.convert("RGB")), self.tags))
+        if photo.mode == "RGBA":
+            converted.putalpha(photo.getchannel("A"))
+        return converted
 
 
 def sentences(remarks: Sequence[str]) -> list[str]:
@@ -215,13 +203,6 @@ def _gamma_of(table: Any) -> float | None:
     return math.log(light) / math.log(0.5) if 0.0 < light < 1.0 else None
 
 
-@lru_cache(maxsize=16)
-def _curve(transfer: str) -> list[int]:
-    """The sRGB values of all values of a transfer function."""
-    values = with_srgb_transfer(np.arange(256) / 255.0, transfer)
-    return [int(value) for value in np.rint(values * 255.0)]
-
-
 @lru_cache(maxsize=1)
 def _lab_profile() -> bytes:
     return ImageCms.ImageCmsProfile(ImageCms.createProfile("LAB")).tobytes()
@@ -242,11 +223,6 @@ def _by_profile(profile: bytes, photo: Image.Image, mode: str) -> Image.Image:
     if photo.mode == "RGBA":
         converted.putalpha(photo.getchannel("A"))
     return converted
-
-
-@lru_cache(maxsize=4)
-def _lookup(colors: Colors) -> ImageFilter.Color3DLUT:
-    return ImageFilter.Color3DLUT(SIDE, srgb_table(colors).ravel(), _copy_table=False)
 
 
 @lru_cache(maxsize=16)

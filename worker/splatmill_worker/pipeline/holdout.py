@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from splatmill.schema import TrainOptions
+from splatmill.schema import MIN_PHOTOS, TrainOptions
 from splatmill.schema.quantities import counted, listed
 from splatmill_worker.errors import Refusal
 from splatmill_worker.images.copies import warning as copies_warning
@@ -74,7 +75,22 @@ def honest_split(scene: Scene, options: TrainOptions) -> Split:
             (name, f"it is nearly the same as {held}, which is held out") for name, held in near.items()
         ]
         train = tuple(view for view in train if view.name not in near)
-    return Split(train, test, tuple(left_out), tuple(warnings))
+    return Split(train, test, tuple(left_out), (*warnings, *_few(train, test)))
+
+
+def _few(train: Sequence[View], test: Sequence[View]) -> list[str]:
+    """A warning where so few photos are trained on that most of the scene is seen from one side; none otherwise."""
+    if len(train) >= MIN_PHOTOS:
+        return []
+    trained = f"Only {counted(len(train), 'photo is', 'photos are')} trained on"
+    held = (
+        f", and {counted(len(test), 'photo is', 'photos are')} held out" if test else ", and none is held out"
+    )
+    advice = " or hold out fewer with the options holdout and test_views" if test else ""
+    return [
+        f"{trained}{held}. What fewer than {MIN_PHOTOS} photos show has no certain depth, so views from other places "
+        f"will be wrong. Give more photos{advice}: 20 or more make a good scene."
+    ]
 
 
 def split_views(scene: Scene, options: TrainOptions) -> tuple[tuple[View, ...], tuple[View, ...]]:

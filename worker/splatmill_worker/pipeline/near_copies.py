@@ -62,7 +62,8 @@ def near_copies(
 def same_photos(scene: Scene) -> dict[str, str]:
     """The photo of which each of some photos is a copy, resized or brightened for example, by their names.
 
-    Of all that are copies of one another, the original is the same: the one with the most pixels.
+    Of all that are copies of one another, the original is the same: the one with the most pixels, and of those with as
+    many the one with the fewest clipped ones.
     """
     ranked = sorted(scene.views, key=lambda view: (-view.camera.width * view.camera.height, view.name))
     rank = {view.name: index for index, view in enumerate(ranked)}
@@ -76,7 +77,13 @@ def same_photos(scene: Scene) -> dict[str, str]:
                 small[each.name] = small_picture(each)
         if is_copy(small[other.name], small[view.name], one_place=shift <= ONE_PLACE):
             found[other.name] = view.name
-    return found
+    for original in dict.fromkeys(found.values()):
+        alike = [original, *(name for name, of in found.items() if of == original)]
+        best = min(alike, key=lambda name: (-small[name].pixels, small[name].clipped, name))
+        if best != original:
+            found |= dict.fromkeys(alike, best)
+            del found[best]
+    return dict(sorted(found.items()))
 
 
 def small_picture(view: View) -> SmallPicture:

@@ -5,6 +5,7 @@ import re
 import unicodedata
 from os.path import splitext
 from typing import Annotated
+from urllib.parse import unquote
 
 from pydantic import AfterValidator
 
@@ -97,3 +98,12 @@ def _mended(part: str, first: bool, last: bool) -> str:
 
 
 FileName = Annotated[str, AfterValidator(safe_name)]
+
+
+def readings(name: str) -> tuple[str, ...]:
+    """Return the paths that a name in a file of cameras may stand for, in order of preference.
+
+    Programs write it with the slashes of their system, with `./` in front, or percent-encoded as in addresses.
+    """
+    plain = name.replace("\\", "/").removeprefix("./")
+    return tuple(dict.fromkeys((plain, unquote(plain))))

@@ -17,7 +17,7 @@ import numpy.typing as npt
 import pytest
 from PIL import Image
 
-from splatmill_worker.images.colors import Colors, srgb
+from splatmill_worker.images.colors import Colors, srgb, srgb_pixels
 from splatmill_worker.images.decoding import decoders
 from splatmill_worker.images.prepare import prepare
 from splatmill_worker.images.video import video_frame
@@ -194,6 +194,31 @@ def test_hdr_and_wide_gamut_show_the_colours_of_sdr(kind: str, tmp_path: Path) -
     assert np.abs(error * matt).mean() < 1.2
     assert np.abs(error * matt).max() <= 5
     assert any("converted" in said for said in decoders.video_remarks(path))
+
+
+COLORS = {
+    "PQ": ((9, 16), Colors("BT.2020", "PQ")),
+    "HLG": ((9, 18), Colors("BT.2020", "HLG")),
+    "PQ with P3": ((12, 16), Colors("Display P3", "PQ")),
+    "HLG with SDR's primaries": ((1, 18), Colors("sRGB", "HLG")),
+    "SDR with BT.2020": ((9, 14), Colors("BT.2020", "sRGB")),
+    "SDR with Display P3": ((12, 1), Colors("Display P3", "sRGB")),
+    "linear": ((1, 8), Colors("sRGB", "linear")),
+}
+
+
+@pytest.mark.parametrize("kind", COLORS)
+def test_every_colour_is_that_of_the_rule(kind: str) -> None:
+    """Of random colours, outside of sRGB too, by the rule in float64; 3 levels are swscale's way to 16 bits."""
+    (primaries, transfer), colors = COLORS[kind]
+    signal = np.random.default_rng(3).integers(0, 1 << 10, (120, 160, 3))
+    signal[:20] = signal[:20, :, :1]  # greys
+    exact = 255.0 * srgb(signal / 1023, colors)
+    frame = av.VideoFrame.from_ndarray(signal.astype(np.uint16), format="gbrp10le")
+    frame.color_primaries, frame.color_trc, frame.colorspace, frame.color_range = primaries, transfer, 0, 2
+    assert np.abs(np.asarray(video_frame.picture(frame, None)) - exact).max() < 3.0
+    pixels = np.rint(signal / 1023 * 65535).astype(np.uint16)
+    assert np.abs(srgb_pixels(pixels, colors) - exact).max() < 0.56
 
 
 @pytest.mark.parametrize("transfer", ["HLG", "PQ"])

@@ -3,6 +3,7 @@
 Names with spaces, text of other programs and systems, photos in several sizes, and frames without a pose.
 """
 
+import json
 import shutil
 import unicodedata
 from collections.abc import Callable
@@ -48,6 +49,16 @@ def test_names_with_spaces_survive_the_text_that_is_written(
 
 
 # Text as other programs write it.
+
+PLY = """ply
+format ascii 1.0
+element vertex 1
+property float x
+property float y
+property float z
+end_header
+1 2 3
+"""
 
 WRITERS: dict[str, Callable[[str], bytes]] = {
     "a byte-order mark": lambda text: text.encode("utf-8-sig"),
@@ -146,6 +157,35 @@ def test_masks_and_points_with_backslashes_are_found(tmp_path: Path) -> None:
     transforms(tmp_path / "transforms.json", given)
     views = {view.name: view for view in loaded(tmp_path).views}
     assert views[NAMES[0]].mask == tmp_path / "cut/m.png"
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-be", "utf-32", "utf-32-le"])
+def test_transforms_in_any_encoding_of_unicode(tmp_path: Path, encoding: str) -> None:
+    photos(tmp_path / "images")
+    transforms(tmp_path / "transforms.json", change=lambda text: text.encode(encoding))
+    check(loaded(tmp_path), ALL)
+
+
+def test_names_written_as_in_addresses_are_those_of_photos_masks_points_and_lists(tmp_path: Path) -> None:
+    """The files keep their own names, whatever program encoded them."""
+    photos(tmp_path / "images")
+    photos(tmp_path / "my sam", ["cut out.png"])
+    (tmp_path / "my points.ply").write_text(PLY)
+    given = frames([name.replace(" ", "%20") for name in NAMES])
+    given[0]["mask_path"] = "my%20sam/cut%20out.png"
+    document = {"w": 64, "h": 48, "fl_x": 60, "fl_y": 61, "cx": 32, "cy": 24, "frames": given}
+    document |= {
+        "ply_file_path": "my%20points.ply",
+        "test_filenames": [f"images/{NAMES[2]}"],
+        "train_filenames": [f"images/{name}" for name in (*NAMES[:2], *NAMES[3:])],
+    }
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    scene = loaded(tmp_path)
+    masks = {view.name: view.mask for view in scene.views if view.mask}
+    assert masks[NAMES[0]] == tmp_path / "my sam/cut out.png"
+    np.testing.assert_array_equal(scene.points, [[1, 2, 3]])
+    assert [view.name for view in scene.views if view.split == "test"] == [NAMES[2]]
+    assert not [warning for warning in scene.warnings if "points.ply" in warning]
 
 
 @pytest.mark.parametrize("named", ["./masks/cut_0.png", "sam\\Cut_0.png", "/home/me/scan/sam/cut_0.png"])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import struct
 from fractions import Fraction
-from functools import lru_cache
 from typing import Any
 
 import av
@@ -14,7 +13,7 @@ from av.filter import Graph
 from av.video.reformatter import ColorRange, Interpolation
 from PIL import Image
 
-from splatmill_worker.images.colors import SRGB, Colors, srgb_table
+from splatmill_worker.images.colors import SRGB, srgb_pixels
 from splatmill_worker.images.flow import Grey
 from splatmill_worker.images.video.video_tags import Tags, tags_of
 
@@ -85,8 +84,7 @@ def grey(frame: av.VideoFrame, aspect: Fraction | None, side: int) -> Grey:
 
 def picture(frame: av.VideoFrame, aspect: Fraction | None) -> Image.Image:
     """A frame as an sRGB picture, upright."""
-    # The lines between are of another moment.
-    image = Image.fromarray(_srgb(_filtered("field", frame) if frame.interlaced_frame else frame))
+    image = Image.fromarray(_srgb(_field(frame) if frame.interlaced_frame else frame))
     size = shown_size(frame, aspect)
     if image.size != size:
         image = image.resize(size, Image.Resampling.LANCZOS)
@@ -113,9 +111,8 @@ def _srgb(frame: av.VideoFrame) -> Pixels:
         return np.asarray(rgb.to_ndarray(), np.uint8)
     # swscale fills 16 bits with a value of n bits by a shift; of limited range, the value has 8 bits and a fraction.
     bits = frame.format.components[0].bits if tags.range == ColorRange.JPEG else 8
-    hald = _hald(tags.colors, ((1 << bits) - 1 << 16 - bits) / 65535)
-    deep = _filtered("haldclut", rgb, av.VideoFrame.from_ndarray(hald, format="rgb48le"))
-    return np.asarray(np.asarray(deep.to_ndarray(), np.uint16) >> 8, np.uint8)
+    white = ((1 << bits) - 1 << 16 - bits) / 65535
+    return srgb_pixels(np.asarray(rgb.to_ndarray(), np.uint16), tags.colors, white)
 
 
 def _reformatted(
@@ -139,31 +136,19 @@ def _reformatted(
     )
 
 
-def _filtered(name: str, *frames: av.VideoFrame) -> av.VideoFrame:
-    """What the filter `name` of FFmpeg makes of its inputs, without options."""
-    tick = Fraction(1, 1000)
+def _field(frame: av.VideoFrame) -> av.VideoFrame:
+    """Every second line of an interlaced frame: those between are of another moment."""
     graph = Graph()
-    node, sink = graph.add(name), graph.add("buffersink")
-    sources = []
-    for index, frame in enumerate(frames):
-        sources.append(
-            graph.add_buffer(width=frame.width, height=frame.height, format=frame.format, time_base=tick)
-        )
-        sources[-1].link_to(node, 0, index)
+    source = graph.add_buffer(
+        width=frame.width, height=frame.height, format=frame.format, time_base=Fraction(1, 1000)
+    )
+    node, sink = graph.add("field"), graph.add("buffersink")
+    source.link_to(node)
     node.link_to(sink)
     graph.configure()
-    for source, frame in zip(sources, frames, strict=True):
-        frame.pts, frame.time_base = 0, tick
-        source.push(frame)
-        source.push(None)
+    frame.pts, frame.time_base = 0, Fraction(1, 1000)
+    source.push(frame)
+    source.push(None)
     result = sink.pull()
     assert isinstance(result, av.VideoFrame)
     return result
-
-
-@lru_cache(maxsize=4)
-def _hald(colors: Colors, white: float) -> npt.NDArray[np.uint16]:
-    """The table `srgb_table` as the picture [512,512,3] that haldclut reads; its upper bytes are the rounded values."""
-    table = srgb_table(colors, white)
-    side = round(len(table) ** 1.5)
-    return (table.reshape(side, side, 3) * (255.0 * 256.0) + 128.0).astype(np.uint16)

@@ -17,7 +17,7 @@ from splatmill_worker.readers.colmap_files import place
 from splatmill_worker.scene import Camera, Lens, PointViews, Scene, Source, View
 from splatmill_worker.sfm.posed import model_files
 from splatmill_worker.sfm.posed.encodings import decoded
-from splatmill_worker.sfm.posed.files import ImageFiles, instead, missing, none_usable, readings
+from splatmill_worker.sfm.posed.files import ImageFiles, alternatives, instead, missing, none_usable
 from splatmill_worker.sfm.posed.model_files import GivenModel, ModelPoints
 from splatmill_worker.sfm.posed.one_camera import one_for_each
 
@@ -109,7 +109,7 @@ def scene_of_given(model: GivenModel, files: ImageFiles, notes: tuple[str, ...] 
     if not views:
         if not lacking:
             raise ValueError("The COLMAP model has no registered photo. Give one that has, or leave it out.")
-        several = readings(first := lacking[0][0], files)
+        several = alternatives(first := lacking[0][0], files)
         raise ValueError(
             f"The COLMAP model names {len(lacking)} photos (such as {first!r}), and the capture has "
             + (f"several of this name: {several}." if several else f"none of them{instead(files)}.")

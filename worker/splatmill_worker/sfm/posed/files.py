@@ -11,11 +11,10 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Literal
-from urllib.parse import unquote
 
 from splatmill.data_sets import walk
 from splatmill.schema.files.masks import masks_beside, paired, without_mask_folder
-from splatmill.schema.files.names import UnsafeName, storable_name
+from splatmill.schema.files.names import UnsafeName, readings, storable_name
 from splatmill.schema.files.photos import PHOTO_SUFFIXES
 from splatmill.schema.quantities import counted
 from splatmill_worker.errors import Refusal, UnusablePicture
@@ -96,7 +95,11 @@ class ImageFiles:
 
     def named_mask(self, name: str) -> Path | None:
         """The mask that a file of cameras names; None when there is none, or no single one."""
-        parts = [part for part in folded(name).split("/") if part not in (".", "..", "")]
+        return next((found for path in readings(name) if (found := self._mask_at(path)) is not None), None)
+
+    def _mask_at(self, path: str) -> Path | None:
+        """The mask with the most trailing parts as `path`, if it is the only one."""
+        parts = [part for part in folded(path).split("/") if part not in (".", "..", "")]
         inner = without_mask_folder("/".join(parts))
         for wanted in [parts] if inner is None else [inner.split("/"), parts]:
             for length in range(len(wanted), 0, -1):
@@ -112,7 +115,9 @@ class ImageFiles:
 
     def candidates(self, name: str) -> list[str]:
         """The photos that `name` fits equally well."""
-        best = self._fitting(name) or self._fitting(unquote(name))
+        best: list[str] = []
+        for path in readings(name):
+            best = best or self._fitting(path)
         # A colon is changed only where the name begins with its letter, so both the path and its last part are tried.
         for changed in () if best else (name, name.rpartition("/")[2]):
             with suppress(UnsafeName):
@@ -135,9 +140,7 @@ class ImageFiles:
 
     def _fitting(self, name: str) -> list[str]:
         """The photos that the very `name` fits equally well."""
-        parts = [
-            part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in (".", "..", "/")
-        ]
+        parts = [part for part in PurePosixPath(name).parts if part not in (".", "..", "/")]
         best: list[str] = []
         for key in (str, folded):
             best = self._best([key(part) for part in parts], key)
@@ -219,7 +222,7 @@ def folded(name: str) -> str:
     return unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold())
 
 
-def readings(name: str, files: ImageFiles) -> str:
+def alternatives(name: str, files: ImageFiles) -> str:
     """The photos that a name may refer to, as a part of a sentence, where they are several; else empty."""
     several = files.candidates(name)
     return f"it may be {several[0]} or {several[1]}; leave one of them out" if len(several) > 1 else ""
@@ -244,5 +247,5 @@ def none_usable(unusable: Sequence[tuple[str, str]]) -> Refusal:
 
 def missing(name: str, files: ImageFiles, given: str) -> str:
     """Why no photo is used for a name that has a camera. given: what has the camera."""
-    several = readings(name, files)
+    several = alternatives(name, files)
     return f"{given}, and {several}" if several else f"{given}, but the capture has no such photo"

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
+from splatmill.schema.files.names import readings
 from splatmill.schema.quantities import counted
 from splatmill_worker.scene import View
 
@@ -48,7 +49,7 @@ def of_lists(path: Path, document: dict[str, Any]) -> dict[str, set[Part]]:
 
 def plain(name: str) -> str:
     """The name of a photo in a transforms file, as it is compared with those in a list."""
-    return name.replace("\\", "/").removeprefix("./")
+    return readings(name)[-1]
 
 
 def unknown(path: Path, listed: Iterable[str], frames: Iterable[Any]) -> list[str]:

@@ -11,13 +11,14 @@ import math
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, overload
 
 import numpy as np
 import numpy.typing as npt
 
 from splatmill.data_sets import keyframes
+from splatmill.schema.files.names import readings
 from splatmill.schema.quantities import format_bytes, listed
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.errors import Refusal, UnusablePicture
@@ -29,7 +30,7 @@ from splatmill_worker.sfm.posed import parts, polycam
 from splatmill_worker.sfm.posed.camera_models import UnreadModel, check_pixels, is_fisheye, radians
 from splatmill_worker.sfm.posed.colmap_model import camera_and_lens, fit_to_file
 from splatmill_worker.sfm.posed.encodings import NamesUnclear, chosen
-from splatmill_worker.sfm.posed.files import ImageFiles, instead, missing, none_usable, readings
+from splatmill_worker.sfm.posed.files import ImageFiles, alternatives, instead, missing, none_usable
 from splatmill_worker.sfm.posed.model_files import MAX_DISTANCE, MAX_PARAMETER, MAX_SIDE, MOST_FAULTY
 from splatmill_worker.sfm.posed.one_camera import one_for_each
 from splatmill_worker.sfm.posed.parts import Part
@@ -122,7 +123,7 @@ def load(
                 f"{len(unmasked)}, such as {unmasked[0]}."
             )
         if document.get("ply_file_path"):
-            points, note = _sparse_points(path.parent / _local(str(document["ply_file_path"])), capture)
+            points, note = _sparse_points(path.parent, str(document["ply_file_path"]), capture)
             warnings += [note] if note else []
     distinct, contradictory = one_for_each(given, where.__getitem__)
     left_out += contradictory
@@ -135,7 +136,7 @@ def load(
         raise ValueError(f"{listed([path.name for path in paths])} has no frames: it places no photo.")
     if not views:
         first = f" (such as {left_out[0][0]!r})" if left_out else ""
-        several = readings(left_out[0][0], files) if left_out else ""
+        several = alternatives(left_out[0][0], files) if left_out else ""
         raise ValueError(
             f"{listed([path.name for path in paths])} has {len(left_out)} cameras{first}, and the capture has "
             + (
@@ -255,8 +256,8 @@ def _view(
 
 def _named_mask(path: Path, name: str, files: ImageFiles, capture: Path) -> Path | None:
     """The mask that a frame of the file `path` names; None where the capture has none."""
-    beside = path.parent / _local(name)
-    return beside if _within(beside, capture) and beside.is_file() else files.named_mask(_local(name))
+    beside = _file(path.parent, name, capture)
+    return beside if beside is not None else files.named_mask(name)
 
 
 def _has_no_pose(frame: Any) -> bool:
@@ -280,9 +281,10 @@ def _called(index: int, frame: Any, files: ImageFiles) -> str:
     return name if found is None else found[0]
 
 
-def _local(path: str) -> str:
-    """A path of a transforms file with the slashes of this system."""
-    return path.replace("\\", "/")
+def _file(folder: Path, name: str, capture: Path) -> Path | None:
+    """The file in the capture that a transforms file in `folder` names; None where there is none."""
+    paths = (folder / path for path in readings(name))
+    return next((path for path in paths if _within(path, capture) and path.is_file()), None)
 
 
 def world_to_camera(matrix: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
@@ -405,16 +407,18 @@ def _within(path: Path, capture: Path) -> bool:
 
 
 def _sparse_points(
-    path: Path, capture: Path
+    folder: Path, name: str, capture: Path
 ) -> tuple[tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8]], str | None]:
     """Positions and colours of nerfstudio's sparse .ply in the world of the transforms; a note when it is unusable."""
     nothing = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
-    if not _within(path, capture):
-        return nothing, f"The points in {path.name} are not used: ply_file_path lies outside the capture."
-    if not path.is_file():
+    written = PurePosixPath(readings(name)[0]).name
+    if not any(_within(folder / path, capture) for path in readings(name)):
+        return nothing, f"The points in {written} are not used: ply_file_path lies outside the capture."
+    path = _file(folder, name, capture)
+    if path is None:
         return (
             nothing,
-            f"The points in {path.name}, which ply_file_path names, are not used: there is no such file.",
+            f"The points in {written}, which ply_file_path names, are not used: there is no such file.",
         )
     try:
         found = decoders.call_once(point_file.read, path, check=_points_of, fault=_points_fault)
