@@ -123,6 +123,17 @@ def seen(page: Page) -> np.ndarray:
     return np.asarray(picture.convert("RGB"), np.float64) / 255.0
 
 
+NOTIFICATIONS = """
+globalThis.notified = [];
+globalThis.Notification = class {
+  static permission = "default";
+  static requestPermission = async () => "granted";
+  constructor(title, more) { notified.push(`${title}: ${more.body}`); }
+};
+"""
+"""In place of the question of the browser, which nobody is there to answer, and of what the desktop shows."""
+
+
 def test_the_scene_is_watched_while_it_trains(service: Up, capture: str, open_window: Open) -> None:
     page = open_window(service, viewport={"width": 800, "height": 500}).page
     job_id = submit(service, capture, time_budget="10m")
@@ -152,10 +163,17 @@ def test_a_whole_job_is_watched_from_its_beginning_to_its_model(
 ) -> None:
     page = open_window(service, viewport={"width": 800, "height": 500}).page
     job_id = submit(service, capture, time_budget="15s")
+    page.add_init_script(NOTIFICATIONS)
     page.goto(f"/jobs/{job_id}")
+    page.get_by_role("button", name="Notify me when it ends").click()
+    expect(page.get_by_role("button", name="Notify me when it ends")).to_have_attribute(
+        "aria-pressed", "true"
+    )
     snapshots(page, 1)
 
     expect(page.locator("#state")).to_have_text("Finished", timeout=60_000)
+    assert page.evaluate("notified") == ["watched: Finished."]
+    expect(page.locator("#left")).to_be_empty()
     link = page.get_by_role("link", name="Open the model")
     expect(link).to_have_attribute("href", f"/models/{job_id}")
     job, report = service.job(job_id), service.http.get(f"/v1/jobs/{job_id}/report").json()
@@ -399,3 +417,44 @@ def test_the_course_of_a_job_follows_from_its_events(page: Page) -> None:
     assert (restarted["state"], restarted["plan"], restarted["lines"]) == ("queued", None, 1)
     assert restarted["seconds"] == {"queued": 100}
     assert restarted["steps"] == [10, 20, 30]
+
+
+SECONDS_LEFT = """async ([at, spent, eta, estimate]) => {
+    const { Course } = await import("/page/any/job/course.js");
+    const { secondsLeft } = await import("/page/any/job/left.js");
+    const course = new Course(), time = (seconds) => new Date(1e12 + 1000 * seconds).toISOString();
+    let now = 0;
+    for (const [state, seconds] of spent) {
+        course.apply({ event: { type: "state", state }, at: time(now), attempt: 1 });
+        now += seconds;
+    }
+    const event = { type: "progress", stage: "training", done: 5, total: 10, eta };
+    if (eta !== null) course.apply({ event, at: time(now), attempt: 1 });
+    return secondsLeft(course, new Map(Object.entries(estimate)), 1e12 + 1000 * (now + at));
+}"""
+
+
+@pytest.mark.parametrize(
+    ("at", "spent", "eta", "left"),
+    [
+        (0, [["queued", 5]], None, 130),
+        (0, [["queued", 5], ["preparing", 4]], None, 126),
+        (0, [["queued", 5], ["preparing", 4], ["sfm", 10]], None, 116),
+        (
+            0,
+            [["queued", 5], ["preparing", 4], ["sfm", 50]],
+            None,
+            106,
+        ),  # longer than others: over at any moment
+        (0, [["queued", 5], ["preparing", 4], ["sfm", 50], ["training", 10]], 70, 76),
+        (5, [["queued", 5], ["preparing", 4], ["sfm", 50], ["training", 10]], 70, 71),
+        (0, [["queued", 5], ["preparing", 4], ["sfm", 50], ["training", 10], ["exporting", 2]], None, 4),
+    ],
+)
+def test_the_time_left_counts_all_that_is_to_come(
+    visit: Visit, at: float, spent: Any, eta: float | None, left: float
+) -> None:
+    estimate = {"cameras": 20, "training": 100, "rest": 10}
+    visit.page.goto("/glossary")
+    assert visit.page.evaluate(SECONDS_LEFT, [at, spent, eta, estimate]) == left
+    assert visit.page.evaluate(SECONDS_LEFT, [at, spent, eta, estimate | {"rest": None}]) is None

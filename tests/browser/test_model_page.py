@@ -317,3 +317,27 @@ def test_edits_that_make_no_sense_are_refused(service: Up, model: SmallModel) ->
     answer = service.http.post(address, json={"max_size": 1e-9})
     assert answer.status_code == 422
     assert answer.json()["detail"] == "The edit leaves no Gaussian of the model."
+
+
+def test_a_model_that_is_deleted_elsewhere_says_so(
+    service: Up, model: SmallModel, shown: Page, visit: Visit
+) -> None:
+    visit.watched.allow("Failed to load resource")
+    seen = "document.dispatchEvent(new Event('visibilitychange'))"
+    service.http.put(f"/v1/bin/jobs/{model.id}").raise_for_status()
+    try:
+        shown.evaluate(seen)
+        notice = shown.locator("#problem")
+        expect(notice).to_contain_text("This model is in the bin, and deleted for good in 23 hours.")
+        shown.reload()
+        notice.get_by_role("button", name="Restore").click()
+        expect(notice).to_be_empty()
+        assert service.http.get("/v1/bin").json()["entries"] == []
+    finally:
+        service.http.delete(f"/v1/bin/jobs/{model.id}")
+    shown.route(f"**/v1/models/{model.id}", lambda route: route.fulfill(status=404, json=GONE))
+    shown.evaluate(seen)
+    expect(notice).to_contain_text("There is no model")
+
+
+GONE = {"code": "model_not_found", "title": "No such model", "status": 404, "detail": "There is no model."}

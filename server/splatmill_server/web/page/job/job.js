@@ -9,6 +9,7 @@ import { renameButton } from "../naming.js";
 import { confirmAction, noticeOf, notify, startShell } from "../shell.js";
 import { Course } from "./course.js";
 import { LiveScene } from "./live_scene.js";
+import { estimateOf, notificationButton, secondsLeft, sentenceOf, showNotification } from "./left.js";
 import { showLog, warningsOf } from "./log.js";
 import { kindsOf, photoParts } from "./photos.js";
 import { planParts } from "./plan.js";
@@ -38,6 +39,9 @@ let course = new Course();
 /** What is shown already, so that parts are made anew only where something changed. */
 let shown = { state: "", plan: null, rows: /** @type {any} */ (null), previews: 0, cameras: null, logged: 0, snapshot: null };
 let drawing = 0;
+/** What the server estimates of each part of the job. @type {Map<string, number | null>} */
+let estimate = new Map();
+let notifies = false;
 let stream = { close() {} };
 const watching = new Watching(id, () => job !== null && watchBox.checked && !course.final && !FINAL.includes(job.state));
 
@@ -63,6 +67,12 @@ function begin() {
     refresh();
   });
   again();
+  const button = FINAL.includes(job.state) ? null : notificationButton((on) => (notifies = on));
+  byId("notify").replaceChildren(...(button ? [button] : []));
+  estimateOf(job).then((known) => {
+    estimate = known;
+    again();
+  }, () => {}); // the photos may be deleted: each stage says by itself how long it takes
 }
 
 function showName() {
@@ -72,9 +82,16 @@ function showName() {
 /** @param {any} record */
 function heard(record) {
   course.apply(record);
-  if (course.final) stream.close();
+  if (course.final) ended();
   if (record.event.type === "state") refresh();
   again();
+}
+
+function ended() {
+  stream.close();
+  byId("notify").replaceChildren();
+  if (notifies) showNotification(job.name || `Job ${id}`, `${badgeText(course.state, false)}.`);
+  notifies = false;
 }
 
 /** @param {boolean} open */
@@ -150,6 +167,7 @@ function draw() {
   }
   document.title = `${titleOf()} - Splatmill`;
   showTimeline(byId("stages"), course, Date.now());
+  byId("left").textContent = course.final ? "" : sentenceOf(secondsLeft(course, estimate, Date.now()));
   if (shown.rows !== course.rows) {
     shown.rows = course.rows;
     chart.update(course.rows);

@@ -1,7 +1,7 @@
 // The page of one model: the viewer with its tools, the comparison with held-out photos, downloads, orbit video, cameras.
 
 import { at } from "../address.js";
-import { get, idOfPage, modelAddress, request } from "../api.js";
+import { Problem, get, idOfPage, modelAddress, request } from "../api.js";
 import { byId, h } from "../dom.js";
 import { ago, bytes } from "../format.js";
 import { showCompare } from "./compare.js";
@@ -58,7 +58,32 @@ async function show(shown) {
   void showOrbit(byId("orbit"), shown);
   const stage = new Stage(shown);
   showCameras(byId("cameras"), shown, stage);
+  document.addEventListener("visibilitychange", () => {
+    if (!document.hidden) void lookWhere(shown);
+  });
+  await lookWhere(shown);
   await stage.open();
+}
+
+/** Say that the model is in the bin, or that it was deleted while another page was shown. @param {{model: any, address: string}} shown */
+async function lookWhere({ model, address }) {
+  const place = byId("problem");
+  try {
+    await request("GET", address);
+    const { entries } = await get("/v1/bin");
+    const entry = entries.find((/** @type {any} */ one) => one.kind === "job" && one.id === model.job);
+    place.replaceChildren();
+    if (!entry) return;
+    const box = noticeOf(`This model is in the bin, and deleted for good ${ago(entry.deleted_at)}.`, "warning");
+    box.append(h("p", {}, h("button", { type: "button", onclick: async () => {
+      await request("DELETE", binned("job", model.job));
+      await lookWhere({ model, address });
+    } }, "Restore")));
+    place.replaceChildren(box);
+  } catch (error) {
+    if (!(error instanceof Problem)) throw error;
+    if (error.status === 404) place.replaceChildren(noticeOf(error)); // otherwise the server is away for a moment
+  }
 }
 
 /** @param {any} model */
