@@ -33,6 +33,7 @@ from splatmill_server.base.filters import Filter
 from splatmill_server.base.lists import Ended, Lists, each
 from splatmill_server.base.problems import ProblemError
 from splatmill_server.base.root_path import address
+from splatmill_server.jobs import names as job_names
 from splatmill_server.jobs.records import Jobs, read_model_record, read_record
 
 _HEADER_BYTES = 8192
@@ -169,9 +170,8 @@ class Models:
 
     def _listed(self, model_ids: Sequence[str], only: Filter) -> dict[str, Model]:
         """Return those of these models that `only` admits, by id. What was read of one is kept for lists."""
-        binned = self.lists.binned(BinKind.job, model_ids)
-        model_ids = [model_id for model_id in model_ids if model_id not in binned]
-        known = {name: _kept(kept) for name, kept in self.lists.records("models", model_ids).items()}
+        kept = self.lists.records("models", model_ids, BinKind.job)
+        known = {name: _kept(record) for name, record in kept.items()}
         asked = [
             name
             for name, record in known.items()
@@ -221,12 +221,16 @@ class Models:
         connection, count = self.lists.connection, 0
         lists.clear(connection, "models")
         ids = [name for name in self.storage.children(layout.models()) if layout.is_id(name)]
+        unread = any(model_id not in succeeded for model_id in ids)
+        renamed = job_names.renamed(self.storage) if unread else frozenset()
         for start in range(0, len(ids), _LISTED_TOGETHER):
             batch = ids[start : start + _LISTED_TOGETHER]
             ended = {model_id: succeeded[model_id] for model_id in batch if model_id in succeeded}
             others = [model_id for model_id in batch if model_id not in succeeded]
             ended |= {
-                record.id: _ended(record) for record in each(self._record, others) if record is not None
+                record.id: _ended(record)
+                for record in each(lambda name: self._record(name, renamed), others)
+                if record is not None
             }
             added = lists.Additions()
             for model_id, record in ended.items():
@@ -242,9 +246,9 @@ class Models:
             count += len(ended)
         return count
 
-    def _record(self, model_id: str) -> Job | None:
+    def _record(self, model_id: str, renamed: frozenset[str] | None = None) -> Job | None:
         try:
-            return read_record(self.storage, model_id).model_copy(update={"id": model_id})
+            return read_record(self.storage, model_id, renamed).model_copy(update={"id": model_id})
         except FileNotFoundError:
             return None
         except UnreadableRecord as error:

@@ -9,6 +9,7 @@ from playwright.sync_api import Page, expect
 
 from tests.browser.conftest import SmallModel
 from tests.support.up import Up
+from tests.support.waiting import wait_for
 
 
 def cancelled_jobs(service: Up, capture: str, count: int) -> list[str]:
@@ -100,6 +101,9 @@ def test_photos_are_deleted_and_restored(service: Up, model: SmallModel, page: P
     capture = service.http.post("/v1/captures", json={"name": "not needed"}).json()["id"]
     photo = b"x" * (64 << 20)  # among the largest
     assert service.http.put(f"/v1/captures/{capture}/images/a.mp4", content=photo).status_code == 201
+    wait_for(
+        lambda: any(record["id"] == capture for record in service.http.get("/v1/storage").json()["largest"])
+    )
     page.goto("/models")
     page.get_by_role("button", name="Delete the photos not needed").click()
     row = page.get_by_role("region", name="Bin", exact=True).get_by_role("row").filter(has_text="not needed")

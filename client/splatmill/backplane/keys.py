@@ -53,6 +53,11 @@ COUNTERS = PREFIX + "queue:counters"
 """Hash of the last numbers given: `back` and `front` of a line, and `turn`."""
 
 
+def in_bin(kind: str, record_id: str) -> str:
+    """Return the field of a record in the hash `BIN`."""
+    return f"{kind}/{record_id}"
+
+
 def line(name: str, owner: str) -> str:
     """Return the key of the waiting entries of an owner in a line, a sorted set in the order of their turns."""
     return f"{PREFIX}queue:line:{name}:{owner}"

@@ -174,14 +174,6 @@ class Lists:
         marks = cast(list[bytes | None], self.connection.mget(names))
         return [record_id for record_id, mark in zip(record_ids, marks, strict=True) if mark is not None]
 
-    def binned(self, kind: BinKind, record_ids: Sequence[str]) -> set[str]:
-        """Return those of the records that are in the bin, which no list shows."""
-        if not record_ids:
-            return set()
-        fields = [f"{kind.value}/{record_id}" for record_id in record_ids]
-        marks = cast(list[bytes | None], self.connection.hmget(keys.BIN, fields))
-        return {record_id for record_id, mark in zip(record_ids, marks, strict=True) if mark is not None}
-
     def missing(self, kind: lists.Kind, record_ids: Sequence[str]) -> list[str]:
         """Return those of the records that are not listed."""
         unlisted = []
@@ -191,12 +183,24 @@ class Lists:
             unlisted += [name for name, score in zip(batch, scores, strict=True) if score is None]
         return unlisted
 
-    def records(self, kind: lists.Kind, record_ids: Sequence[str]) -> dict[str, bytes | None]:
-        """Return what is kept of these records for lists, by id."""
+    def records(
+        self, kind: lists.Kind, record_ids: Sequence[str], without_bin: BinKind | None = None
+    ) -> dict[str, bytes | None]:
+        """Return what is kept of these records for lists, by id.
+
+        without_bin: as what these records may be in the bin; those that are there are left out.
+        """
         if not record_ids:
             return {}
-        kept = cast(list[bytes | None], self.connection.hmget(keys.records(kind), list(record_ids)))
-        return dict(zip(record_ids, kept, strict=True))
+        with self.connection.pipeline(transaction=False) as pipe:
+            pipe.hmget(keys.records(kind), list(record_ids))
+            pipe.hmget(keys.BIN, [keys.in_bin(without_bin or kind, record_id) for record_id in record_ids])
+            kept, binned = pipe.execute()
+        return {
+            record_id: record
+            for record_id, record, mark in zip(record_ids, kept, binned, strict=True)
+            if without_bin is None or mark is None
+        }
 
     def keep(self, kind: lists.Kind, records: Mapping[str, bytes]) -> None:
         """Keep what lists show of these records."""

@@ -166,21 +166,20 @@ class Captures:
         only = only or Filter()
 
         def read(capture_ids: Sequence[str]) -> dict[str, Capture]:
-            captures = self._listed(capture_ids)
-            binned = self.lists.binned(BinKind.capture, capture_ids)
+            captures = self._listed(capture_ids, BinKind.capture)
             return {
                 name: capture
                 for name, capture in captures.items()
-                if name not in binned and only.admits(capture.owner, capture.name)
+                if only.admits(capture.owner, capture.name)
             }
 
         names, narrowed = [lists.name("captures", owner=only.owner)], only.name is not None
         captures, following = self.lists.page(names, cursor, limit, read, narrowed=narrowed)
         return CapturePage(captures=captures, cursor=following)
 
-    def _listed(self, capture_ids: Sequence[str]) -> dict[str, Capture]:
-        """Return the records of those of these captures that exist and can be read, by id."""
-        kept = self.lists.records("captures", capture_ids)
+    def _listed(self, capture_ids: Sequence[str], without_bin: BinKind | None = None) -> dict[str, Capture]:
+        """Return the records of those of these captures that exist and can be read, by id (see `Lists.records`)."""
+        kept = self.lists.records("captures", capture_ids, without_bin)
         missing = [name for name, record in kept.items() if record is None]
         stored = dict(zip(missing, each(self._stored, missing), strict=True))
         self.lists.keep("captures", {name: record for name, record in stored.items() if record is not None})

@@ -7,7 +7,7 @@ from typing import cast
 import redis
 
 from splatmill.backplane import keys, lists
-from splatmill.schema import BinKind, JobPage
+from splatmill.schema import JobPage
 from splatmill_server.base.filters import JobFilter
 from splatmill_server.base.lists import Lists
 from splatmill_server.jobs.links import with_links
@@ -58,8 +58,7 @@ def page(
         return _likely(connection, job_ids, only)
 
     def read(job_ids: Sequence[str]) -> Mapping[str, Held]:
-        binned = listed.binned(BinKind.job, job_ids)
-        held = read_jobs(connection, [job_id for job_id in job_ids if job_id not in binned])
+        held = read_jobs(connection, job_ids, without_bin=True)
         return {
             job_id: held_job
             for job_id, held_job in held.items()

@@ -63,12 +63,15 @@ class StoredEnd:
     generation: int
 
 
-def get_stored_end(storage: Storage, job_id: str) -> StoredEnd | None:
-    """Return a job as it ended, from the file of its log, under its present name, or None."""
+def get_stored_end(storage: Storage, job_id: str, renamed: frozenset[str] | None = None) -> StoredEnd | None:
+    """Return a job as it ended, from the file of its log, under its present name, or None.
+
+    renamed: the jobs that were renamed, where they are known.
+    """
     end = _stored(storage, job_id)[0]
     if end is None or not end.job.state.final:
         return None
-    name = names.get(storage, job_id, end.job.name)
+    name = names.get(storage, job_id, end.job.name, renamed)
     return StoredEnd(end.job.model_copy(update={"name": name}), end.generation)
 
 

@@ -11,7 +11,7 @@ from splatmill.backplane.jobs.events import StoredEvent
 from splatmill.backplane.jobs.fold import fold
 from splatmill.backplane.jobs.row import JobRow
 from splatmill.backplane.storage.records import UnreadableRecord, warn
-from splatmill.schema import Job, JobState
+from splatmill.schema import BinKind, Job, JobState
 
 
 @dataclass(frozen=True)
@@ -32,19 +32,28 @@ class Held:
         return fold(self.row, self.states, self.progress)
 
 
-def read_jobs(connection: redis.Redis, job_ids: Sequence[str]) -> dict[str, Held]:
+def read_jobs(
+    connection: redis.Redis, job_ids: Sequence[str], *, without_bin: bool = False
+) -> dict[str, Held]:
     """Return what Redis holds of these jobs, by id, in their order.
 
     Jobs without a row, or whose row is not readable, are left out; the latter are logged.
+
+    without_bin: whether jobs in the bin are left out too.
     """
     with connection.pipeline(transaction=False) as pipe:
         for job_id in job_ids:
             pipe.hgetall(keys.job(job_id))
             pipe.xrange(keys.states(job_id))
             events.ask_progress(pipe, job_id)
+            pipe.hexists(keys.BIN, keys.in_bin(BinKind.job, job_id))
         replies = iter(pipe.execute())
     jobs = {}
-    for job_id, stored, states, progress in zip(job_ids, replies, replies, replies, strict=True):
+    for job_id, stored, states, progress, binned in zip(
+        job_ids, replies, replies, replies, replies, strict=True
+    ):
+        if binned and without_bin:
+            continue
         try:
             row = JobRow.of(stored)
         except UnreadableRecord as error:

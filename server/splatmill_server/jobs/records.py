@@ -337,7 +337,11 @@ class Jobs:
             pipe.hdel(keys.records("models"), job_id)
 
         self.connection.transaction(set_name, keys.job(job_id))
-        return self.get(job_id)
+        try:
+            return self.get(job_id)
+        except ProblemError:
+            names.delete(self.storage, job_id)  # the job was deleted meanwhile
+            raise
 
     def restart(self, job_id: str, *, check: Callable[[], None], watched: Sequence[str]) -> Job:
         """Enqueue a job that has ended as a new generation, which resumes from its checkpoint if there is one.
@@ -399,6 +403,7 @@ class Jobs:
         self.storage.delete(layout.job_record(job_id))
         self.storage.delete_prefix(layout.model(job_id))
         self.storage.delete_prefix(layout.job(job_id))
+        names.delete(self.storage, job_id)
         with self.connection.pipeline(transaction=True) as pipe:
             pipe.delete(*keys.of_job(job_id))
             lists.remove_job(pipe, job_id, owner, capture)
@@ -526,15 +531,19 @@ def _waits(job_row: JobRow, job: Job) -> bool:
     return False
 
 
-def read_record(storage: Storage, job_id: str) -> Job:
+def read_record(storage: Storage, job_id: str, renamed: frozenset[str] | None = None) -> Job:
     """Return the job in the `job.json` of a model, without what is not readable in it, under its present name.
+
+    renamed: the jobs that were renamed, where they are known.
 
     Raises FileNotFoundError, and UnreadableRecord.
     """
-    return read_model_record(storage, job_id)[0]
+    return read_model_record(storage, job_id, renamed)[0]
 
 
-def read_model_record(storage: Storage, job_id: str) -> tuple[Job, dict[str, Any]]:
+def read_model_record(
+    storage: Storage, job_id: str, renamed: frozenset[str] | None = None
+) -> tuple[Job, dict[str, Any]]:
     """Return the job in the `job.json` of a model, as `read_record` does, and all fields of that file."""
     try:
         record = json.loads(storage.get(layout.job_record(job_id)))
@@ -544,7 +553,7 @@ def read_model_record(storage: Storage, job_id: str) -> tuple[Job, dict[str, Any
         raise UnreadableRecord(f"job.json cannot be read: {reason(error)}") from error
     if left_out:
         warn(layout.job_record(job_id), f"left out what cannot be read: {'; '.join(left_out)[:300]}")
-    return job.model_copy(update={"name": names.get(storage, job_id, job.name)}), record
+    return job.model_copy(update={"name": names.get(storage, job_id, job.name, renamed)}), record
 
 
 def last_stage(job: Job) -> str | None:

@@ -28,7 +28,7 @@ def next_generation(job_row: JobRow, moment: datetime, request: str | None) -> J
     return job_row.model_copy(update=changes | {"cancel_requested_at": None, "verdict": None})
 
 
-def get(storage: Storage, job_id: str) -> JobRow | None:
+def get(storage: Storage, job_id: str, renamed: frozenset[str] | None = None) -> JobRow | None:
     """Return the row of an unfinished job, under its present name, or None if there is none that can be read."""
     path = layout.unfinished_job(job_id)
     try:
@@ -38,7 +38,7 @@ def get(storage: Storage, job_id: str) -> JobRow | None:
     except ValueError as error:
         warn(path, reason(error))
         return None
-    return begun.model_copy(update={"name": names.get(storage, job_id, begun.name)})
+    return begun.model_copy(update={"name": names.get(storage, job_id, begun.name, renamed)})
 
 
 def list_ids(storage: Storage) -> list[str]:

@@ -20,7 +20,7 @@ from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import Event, Job, JobState, PlanEvent, ProgressEvent, StateEvent, StoredKind
 from splatmill_server.base.lists import Ended, Lists, each
 from splatmill_server.jobs import log as job_log
-from splatmill_server.jobs import requests, shrinking
+from splatmill_server.jobs import names, requests, shrinking
 from splatmill_server.jobs.reading import read_jobs
 
 log = structlog.get_logger()
@@ -41,9 +41,10 @@ def make_lists(connection: redis.Redis, storage: Storage, listed: Lists, succeed
     unfinished = requests.list_ids(storage)
     for start in range(0, len(unfinished), _BATCH):
         count += restore_unfinished(connection, storage, unfinished[start : start + _BATCH])
-    ended = storage.children(layout.jobs())
+    ended, renamed = storage.children(layout.jobs()), names.renamed(storage)
     for start in range(0, len(ended), _BATCH):
-        count += _restore_ended(connection, storage, listed, ended[start : start + _BATCH], succeeded)
+        batch = ended[start : start + _BATCH]
+        count += _restore_ended(connection, storage, listed, batch, succeeded, renamed)
     return count
 
 
@@ -62,9 +63,10 @@ def restore_unfinished(connection: redis.Redis, storage: Storage, job_ids: Seque
     They are not put into the queue at once, because a worker that still runs one takes its lease again (see GRACE).
     """
     missing = without_row(connection, job_ids)
+    renamed = names.renamed(storage) if missing else frozenset()
     rows = [
         job_row
-        for job_row in each(lambda job_id: _unfinished(storage, job_id), missing)
+        for job_row in each(lambda job_id: _unfinished(storage, job_id, renamed), missing)
         if job_row is not None
     ]
     if not rows:
@@ -83,10 +85,10 @@ def restore_unfinished(connection: redis.Redis, storage: Storage, job_ids: Seque
     return len(rows)
 
 
-def _unfinished(storage: Storage, job_id: str) -> JobRow | None:
+def _unfinished(storage: Storage, job_id: str, renamed: frozenset[str]) -> JobRow | None:
     """Return the row of an unfinished job, or None if its generation has ended and only the request was left."""
-    request = requests.get(storage, job_id)
-    ended = job_log.get_stored_end(storage, job_id) if request is not None else None
+    request = requests.get(storage, job_id, renamed)
+    ended = job_log.get_stored_end(storage, job_id, renamed) if request is not None else None
     if request is not None and ended is not None and ended.generation >= request.generation:
         storage.delete(layout.unfinished_job(job_id))
         return None
@@ -119,12 +121,13 @@ def _restore_ended(
     listed: Lists,
     job_ids: Sequence[str],
     succeeded: dict[str, Ended],
+    renamed: frozenset[str],
 ) -> int:
     """Restore those of the jobs that have ended and have no row, and return their number."""
     missing = [job_id for job_id in without_row(connection, job_ids) if layout.is_id(job_id)]
     ends = [
         end
-        for end in each(lambda job_id: job_log.get_stored_end(storage, job_id), missing)
+        for end in each(lambda job_id: job_log.get_stored_end(storage, job_id, renamed), missing)
         if end is not None
     ]
     with connection.pipeline() as pipe:

@@ -14,7 +14,7 @@ from splatmill_server.base.filters import JobFilter
 from splatmill_server.base.paging import DEFAULT_LIMIT
 from splatmill_server.base.problems import ProblemError
 from splatmill_server.requests.ownership import JobId, ListedOwner
-from splatmill_server.requests.parameters import Cursor, Limit, NamePart
+from splatmill_server.requests.parameters import JSON_ONLY, Cursor, Limit, NamePart
 from splatmill_server.routes.job_form import create_from_form
 from splatmill_server.routes.openapi import JOB_REQUESTS, answer, problems
 from splatmill_server.service import Service, Shared
@@ -145,7 +145,13 @@ def get_job(service: Shared, job_id: JobId) -> Job:
     return service.jobs.get(job_id)
 
 
-@router.patch("/{job_id}", responses=problems("job_not_found"))
+@router.patch(
+    "/{job_id}",
+    responses=problems(
+        "job_not_found", "malformed_body", "unsupported_media_type", "body_too_large", "storage_full"
+    ),
+    dependencies=[JSON_ONLY],
+)
 def rename_job(service: Shared, job_id: JobId, change: Rename) -> Job:
     """Name a job, and its model with it."""
     return service.jobs.rename(job_id, change.name)

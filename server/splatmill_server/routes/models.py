@@ -93,7 +93,19 @@ def get_model(service: Shared, model_id: ModelId) -> Model:
     return service.models.get(model_id)
 
 
-@router.patch("/{model_id}", responses=problems("model_not_found", "model_not_ready", "model_corrupt"))
+@router.patch(
+    "/{model_id}",
+    responses=problems(
+        "model_not_found",
+        "model_not_ready",
+        "model_corrupt",
+        "malformed_body",
+        "unsupported_media_type",
+        "body_too_large",
+        "storage_full",
+    ),
+    dependencies=[JSON_ONLY],
+)
 def rename_model(service: Shared, model_id: ModelId, change: Rename) -> Model:
     """Name a model, and its job with it. Files of it are downloaded under its name."""
     return service.models.rename(model_id, change.name)

@@ -99,7 +99,7 @@ class Bin:
         there = layout.is_id(record_id) and self.storage.exists(path)
         if there:
             self.storage.delete(path)
-            self.connection.hdel(keys.BIN, f"{kind.value}/{record_id}")
+            self.connection.hdel(keys.BIN, keys.in_bin(kind, record_id))
         return there
 
     def list(self, owner: str | None) -> list[Binned]:
@@ -160,4 +160,4 @@ class Bin:
 
 
 def _field(binned: Binned) -> str:
-    return f"{binned.kind.value}/{binned.id}"
+    return keys.in_bin(binned.kind, binned.id)

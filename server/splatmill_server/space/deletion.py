@@ -105,7 +105,7 @@ class Deletion:
     def _leave_bin(self, kind: BinKind, record_id: str) -> None:
         """Take a record that is deleted from the bin."""
         self.storage.delete(layout.binned(kind, record_id))
-        self.connection.hdel(keys.BIN, f"{kind.value}/{record_id}")
+        self.connection.hdel(keys.BIN, keys.in_bin(kind, record_id))
 
     def work(self, job_id: str, still: Callable[[], bool]) -> bool:
         """Delete the files from which a job that has ended would resume. Return False if `still` does."""

@@ -21,7 +21,6 @@ jobs/{id}/work/...                          checkpoints and other files from whi
 jobs/{id}/log.jsonl                         the job as it ended, then the lines of its log
 jobs/{id}/curve.jsonl                       the curve of the job, a row per line; written when it has ended
 jobs/{id}/cameras.json                      cameras and points as structure from motion placed them
-jobs/{id}/name.json                         the name that the job was given after it was made, and its model with it
 models/{id}/{file}                          model.ply, report.json, report.png, report.html, cameras.json, ...
 models/{id}/held_out/{n}.webp               held-out photo, as the renderings were compared with it
 models/{id}/time_lapse/{n}.ply              snapshot of the training, a compressed .ply
@@ -31,6 +30,7 @@ models/{id}/orbits/{orbit}/orbit.json       record of an orbit video, and how ma
 models/{id}/orbits/{orbit}/frames/{n}.mp4   some of its frames, from the n-th on, until the video is whole
 models/{id}/orbits/{orbit}/orbit.mp4        the video
 models/{id}/job.json                        record of the ended job; written last: a model exists once it does
+names/{job}.json                            the name that a job was given after it was made, and its model with it
 bin/{kind}.{id}.json                        record in the bin, kind job or capture: who it belongs to, and when it goes
 keys/{id}.json                              a key of the API: its owner, scopes, limits, and the digests of its secrets
 keys/{id}.revoked                           the key was revoked; it counts more than the record beside it
@@ -225,9 +225,14 @@ def job_cameras(job_id: str) -> str:
     return f"jobs/{job_id}/cameras.json"
 
 
+def names() -> str:
+    """Return the folder of the names that jobs were given later."""
+    return "names"
+
+
 def job_name(job_id: str) -> str:
     """Return the path of the name that a job was given later. Only the server writes it."""
-    return f"jobs/{job_id}/name.json"
+    return f"names/{job_id}.json"
 
 
 def bin_folder() -> str:

@@ -30,8 +30,11 @@ class CreateJob(Request):
     )
 
     def described(self, *, with_capture: bool = True) -> str:
-        """Return the request as JSON, by which a repeated request is known to be the same."""
-        return self.model_dump_json(exclude=None if with_capture else {"capture"})
+        """Return the request as JSON, by which a repeated request is known to be the same.
+
+        Values that are the default are left out, so that it is the same to a later version, which has more options.
+        """
+        return self.model_dump_json(exclude=None if with_capture else {"capture"}, exclude_defaults=True)
 
 
 class Rename(Request):
