@@ -39,25 +39,43 @@ TRANSFORMS = "transforms*.json"
 KEYFRAMES = ("keyframes/corrected_cameras/", "keyframes/cameras/")
 """Folders in which the raw data of Polycam have a .json file with the camera of each photo, in order of preference."""
 
+PROGRAM_FILES = {
+    "Metashape": ("*.xml",),
+    "RealityScan, RealityCapture (also for Postshot)": ("*.csv", "*.xmp"),
+    "OpenSfM, OpenDroneMap": ("reconstruction.json",),
+    "Bundler": ("*.out",),
+}
+"""Other programs whose cameras are read, with patterns of the names, in lower case, of their files.
+
+Other files have such names too: the worker recognises those with cameras by what is in them."""
+
+LISTS = ("*list*.txt", "*.lst")
+"""Patterns of the names, in lower case, of the lists of photos that belong to cameras of Bundler."""
+
 CAMERA_PROGRAMS = {
     "COLMAP, GLOMAP, and programs that export a COLMAP model": MODEL_FILES,
     "nerfstudio, instant-ngp, Blender (NeRF synthetic)": (TRANSFORMS,),
     "Polycam (raw data)": tuple(f"{folder}*.json" for folder in KEYFRAMES),
+    **PROGRAM_FILES,
 }
 """Programs whose cameras are read, with patterns of the names, in lower case, of their files."""
 
 OTHER_CAMERAS = {
-    "OpenDroneMap or OpenSfM": ("reconstruction.json", "shots.geojson"),
-    "Metashape": ("cameras.xml", "*.psx"),
-    "Bundler": ("bundle*.out",),
+    "OpenDroneMap": ("shots.geojson",),
+    "Metashape (its project)": ("*.psx",),
     "OpenMVG": ("sfm_data.json", "sfm_data.bin"),
     "Meshroom": ("*.sfm",),
     "VisualSFM": ("*.nvm",),
+    "Bundler (with another lens)": ("*.rd",),
+    "KRT, as of Middlebury": ("*_par.txt", "*.krt"),
     "OpenMVS": ("*.mvs",),
     "LLFF": ("poses_bounds.npy",),
     "Record3D": ("*.r3d",),
 }
 """Programs whose cameras are not read, with patterns of the names, in lower case, of their files."""
+
+LARGE = ("*.mvs", "*.r3d")
+"""Patterns of OTHER_CAMERAS whose files hold points or photos too, so that they are not sent to be named by the job."""
 
 
 class TwoDataSets(ValueError):
@@ -72,11 +90,14 @@ class Cameras:
     transforms: names of the transforms*.json files in it, or else of the files in one of its KEYFRAMES.
     models: its folders with a COLMAP model, each with a slash at its end, in order of their numbers. They are
         alternatives: COLMAP writes a model for each set of photos that it could not join with the others.
+    programs: names of the files that may have cameras of PROGRAM_FILES, and of LISTS that belong to them. They are
+        those of photos in any folder, so that they have no data set of their own.
     """
 
     top: str
     transforms: tuple[str, ...] = ()
     models: tuple[str, ...] = ()
+    programs: tuple[str, ...] = ()
 
 
 def walk(root: Path, left_out: dict[str, str] | None = None) -> list[str]:
@@ -163,8 +184,9 @@ def find_cameras(names: Sequence[str]) -> Cameras | None:
     for top, ranked in captured.items():
         transforms.setdefault(top, ranked[min(ranked)])
     tops = sorted({*transforms, *models}, key=lambda top: (top.count("/"), top))
+    programs = program_files(names)
     if not tops or tops[0].count("/") > MAX_DEPTH:
-        return None
+        return Cameras("", programs=programs) if programs else None
     if len(tops) > 1 and tops[1].count("/") == tops[0].count("/"):
         raise TwoDataSets(
             f"There are cameras of several data sets, in {tops[0]} and in {tops[1]}. Give the folder of one of them."
@@ -173,14 +195,33 @@ def find_cameras(names: Sequence[str]) -> Cameras | None:
     candidates = models.get(top, [])
     best = min((rank for rank, _ in candidates), default=0)
     folders = sorted((folder for rank, folder in candidates if rank == best), key=_number)
-    return Cameras(top, tuple(transforms.get(top, ())), tuple(folders))
+    return Cameras(top, tuple(transforms.get(top, ())), tuple(folders), programs)
+
+
+def program_files(names: Sequence[str]) -> tuple[str, ...]:
+    """Those of some names that files with cameras of PROGRAM_FILES may have, and of LISTS beside cameras of Bundler."""
+    patterns = [pattern for each in PROGRAM_FILES.values() for pattern in each]
+    lists = LISTS if any(fits(name, PROGRAM_FILES["Bundler"]) for name in names) else ()
+    return tuple(name for name in names if fits(name, (*patterns, *lists)))
+
+
+def named_by_job(names: Sequence[str]) -> list[str]:
+    """Those of some names whose files have cameras that are not read, and are sent so that the job says so."""
+    patterns = [each for one in OTHER_CAMERAS.values() for each in one if each not in LARGE]
+    return [name for name in names if fits(name, patterns)]
+
+
+def fits(name: str, patterns: Sequence[str]) -> bool:
+    """Whether the last part of a name fits one of some patterns in lower case."""
+    base = _split(name)[1].lower()
+    return any(fnmatchcase(base, pattern) for pattern in patterns)
 
 
 def is_camera_file(name: str) -> bool:
     """Whether a file of this name, without a folder, holds cameras or a part of them."""
     base = name.lower()
-    return base in (*MODEL_PARTS, "points3d.bin", "points3d.txt", "database.db") or fnmatchcase(
-        base, TRANSFORMS
+    return base in (*MODEL_PARTS, "points3d.bin", "points3d.txt", "database.db") or fits(
+        name, (TRANSFORMS, "reconstruction.json")
     )
 
 
@@ -194,17 +235,16 @@ def unread_cameras(names: Sequence[str]) -> list[str]:
 
     They are of OTHER_CAMERAS, lie too deep, or are a part of a COLMAP model.
     """
-    bases = [(name, _split(name)[1].lower()) for name in names]
     recovered = "cameras are recovered from the photos."
     said = []
     for program, patterns in OTHER_CAMERAS.items():
-        first = next((name for name, base in bases if any(fnmatchcase(base, one) for one in patterns)), None)
+        first = next((name for name in names if fits(name, patterns)), None)
         if first is not None:
             said.append(
                 f"The cameras of {program} in {first} are not read: {recovered} To use those, export them from there "
                 "as a COLMAP model or a transforms.json."
             )
-    first = next((name for name, base in bases if base in MODEL_PARTS or fnmatchcase(base, TRANSFORMS)), None)
+    first = next((name for name in names if fits(name, (*MODEL_PARTS, TRANSFORMS))), None)
     if first is not None:
         said.append(
             f"{first} is not read: {recovered} A COLMAP model has cameras and images, both as .bin or both as .txt, "

@@ -207,6 +207,27 @@ def _cameras() -> list[str]:
         the only one. Of the same photos in several sizes, as in `images_2` and `images_4`, the largest are used. A
         camera may be of another size than its photo, with the same shape up to {colmap_model.MAX_ASPECT_ERROR:.0%}.
 
+        Cameras of other programs are used where there is neither a COLMAP model nor a `transforms.json`. Their files
+        may lie in any folder, and are recognised by what is in them. Of two files of one program, the one in the outer
+        folder is used; where both lie equally deep, the job fails and names them. Photos are found by the names in the
+        file, with or without their suffix.
+
+        - **Metashape**: File > Export > Export Cameras, as Agisoft XML. Lenses of the types frame and fisheye are
+        read, with f, cx, cy, b1, k1 to k4, p1 and p2; a skew b2 is left out where it moves corners by less than half a
+        pixel, and else refused. Of several chunks or components, the one with the most cameras is used. Cameras far
+        from the origin, as on the earth, are moved to it. Those of rigs are left out.
+
+        - **RealityScan and RealityCapture**: the CSV of internal and external camera parameters (name, x, y, alt or z,
+        heading, pitch, roll, f, px, py, k1 to k4, t1, t2), which Postshot takes too, or an XMP beside each photo. The
+        rotation of a CSV is Rz(-heading) Rx(pitch) Ry(roll), from a camera with OpenGL axes to the world. t1 is taken
+        as the coefficient of r² + 2x². Of the lenses of an XMP, perspective and brown are read.
+
+        - **OpenSfM and OpenDroneMap**: `reconstruction.json`, with its points; lenses of the types perspective, brown,
+        radial, simple_radial, fisheye and fisheye_opencv. Of several reconstructions, the one with the most photos.
+
+        - **Bundler**, as COLMAP, RealityScan, Metashape and others write it too: version 0.3, with its points. The
+        names of the photos are in a list beside it, such as `list.txt`, which is needed.
+
         A frame without a matrix is left out with a warning. Up to {model_files.MOST_FAULTY:.0%} of the poses are left
         out if no camera can have them (mirrored, sheared, not finite); with more, the job fails and names the first. It
         fails also if no photo has a camera, or if a file with cameras cannot be read.""",
@@ -220,7 +241,7 @@ def _cameras() -> list[str]:
             ["program", "files, in either case"],
             [[program, choices(names)] for program, names in OTHER_CAMERAS.items()],
         ),
-        "Cameras are then recovered from the photos, and a sentence names the file.",
+        "Cameras are then recovered from the photos, and a sentence names the file, in the report too.",
     ]
 
 

@@ -47,7 +47,11 @@ TREES = {
     "keyframes/corrected_cameras/1.json keyframes/depth/1.png mesh_info.json",
     "raw data of Polycam some folders down": "x/Scan/Keyframes/images/1.jpg x/Scan/Keyframes/cameras/1.json x/raw.glb",
     "kinds that are not read": "a.jpg b.DNG c.dng old.bmp photos.rar x/VID_1.insv film.mts clip.mp4",
-    "cameras that are not read": "images/a.jpg opensfm/Reconstruction.json cameras.xml scan.nvm bundle.rd.out a.xml",
+    "cameras that are not read": "images/a.jpg a/scene.SFM scan.nvm b.rd x.mvs temple_par.txt",
+    "cameras of other programs": "images/a.jpg images/a.xmp opensfm/Reconstruction.json cameras.XML scan.nvm "
+    "bundle.out list.txt bundle.list.txt notes.txt r.csv c.lst",
+    "lists without cameras": "a.jpg list.txt c.lst",
+    "cameras of other programs without photos": "walk.mp4 cameras.xml scan.nvm",
     "half a model": "images/a.jpg sparse/0/images.txt sparse/0/points3D.txt",
     "cameras that are not needed": "images/a.jpg transforms.json cameras.xml",
     "videos": "a.mov b.webm",

@@ -21,8 +21,9 @@ Real = npt.NDArray[np.floating[Any]]
 NAMED = 3
 """Files left out for one reason, up to which each has a sentence of its own."""
 
-Source = Literal["sfm", "colmap", "transforms", "blender"]
-"""Where cameras come from: structure from motion, a COLMAP model, transforms.json, or a Blender data set."""
+Source = Literal["sfm", "colmap", "transforms", "blender", "program"]
+"""Where cameras come from: structure from motion, a COLMAP model, transforms.json, a Blender data set, or the file of
+another program."""
 
 MIN_DEPTH = 1e-9
 """Smallest depth, in world units, at which a point is projected; nearer ones and those behind the camera are not."""

@@ -13,6 +13,7 @@ from splatmill.data_sets import (
     TwoDataSets,
     find_cameras,
     is_camera_file,
+    named_by_job,
     place_of_model,
     unread_cameras,
     unreadable_file,
@@ -179,6 +180,9 @@ def find_files(path: str | os.PathLike[str]) -> Found:
         others = beside_photos(inside)
     points = _named(documents, "ply_file_path", cameras.top).intersection(names)
     poses |= {name: name.removeprefix(cameras.top) for name in points if _suffix(name) == ".ply"}
+    posed = bool(poses or (pictures and cameras.programs))
+    if pictures:
+        poses |= {name: name for name in (*cameras.programs, *named_by_job(names))}
     files: list[LocalFile] = []
     ignored: list[str] = []
     for name in names:
@@ -213,7 +217,7 @@ def find_files(path: str | os.PathLike[str]) -> Found:
     capture_files = Found.of(files, ignored)
     if not capture_files.count(Role.images):
         raise NothingToUpload(capture_files.left_out[0][1], "Rename the files.")
-    remarks = around + _left_out(unreadable) + unread(ignored) + ([] if poses else unread_cameras(ignored))
+    remarks = around + _left_out(unreadable) + unread(ignored) + ([] if posed else unread_cameras(names))
     beside = [name for name in ignored if _suffix(name) in VIDEO_SUFFIXES + ARCHIVE_SUFFIXES]
     if beside:
         remarks.append(f"Videos and zips are not used where there are photos: {listed(beside)}.")

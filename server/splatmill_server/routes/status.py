@@ -18,7 +18,7 @@ from splatmill.backplane.queue import entries, lines, workers
 from splatmill.backplane.queue.lines import Waiting
 from splatmill.backplane.queue.workers import WorkerRecord
 from splatmill.backplane.rendering import RendererState
-from splatmill.data_sets import OTHER_CAMERAS
+from splatmill.data_sets import LARGE, LISTS, OTHER_CAMERAS, PROGRAM_FILES
 from splatmill.schema import (
     ARCHIVE_SUFFIXES,
     MASK_BEGINNINGS,
@@ -99,6 +99,9 @@ def get_info(service: Shared, who: Who) -> Info:
             output_marks=list(OUTPUT_MARKS),
             output_media=list(OUTPUT_MEDIA),
             unread=[Unread(**asdict(kind)) for kind in UNREAD_KINDS],
+            program_files=[pattern for patterns in PROGRAM_FILES.values() for pattern in patterns],
+            camera_lists=list(LISTS),
+            large_cameras=list(LARGE),
             other_cameras={program: list(names) for program, names in OTHER_CAMERAS.items()},
             min_photos=MIN_PHOTOS,
             min_photo_side=MIN_PHOTO_SIDE,

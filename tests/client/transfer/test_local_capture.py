@@ -315,13 +315,10 @@ def test_paths_with_nothing_to_train(tmp_path: Path):
             ["pictures of other formats: old.bmp. Save", "other formats: photos.rar"],
         ),
         (["a.jpg", "x/VID_1.insv"], ["360-degree camera: x/VID_1.insv. Export flat"]),
+        (["images/a.jpg", "opensfm/reconstruction.json"], []),
         (
-            ["images/a.jpg", "opensfm/reconstruction.json"],
-            ["cameras of OpenDroneMap or OpenSfM in opensfm/rec"],
-        ),
-        (
-            ["a.jpg", "cameras.xml", "Poses_Bounds.npy"],
-            ["Metashape in cameras.xml", "LLFF in Poses_Bounds.npy"],
+            ["a.jpg", "scene.SFM", "Poses_Bounds.npy"],
+            ["Meshroom in scene.SFM", "LLFF in Poses_Bounds.npy"],
         ),
         (["images/a.jpg", "sparse/0/cameras.bin", "sparse/0/images.bin", "cameras.xml"], []),
         (["a.jpg", "clip.mp4", "more.zip"], ["not used where there are photos: clip.mp4, more.zip"]),

@@ -11,6 +11,7 @@ from tests.support.hostile.table_lenses import LENSES
 from tests.support.hostile.table_models import MODELS
 from tests.support.hostile.table_others import OTHERS
 from tests.support.hostile.table_poses import POSES
+from tests.support.hostile.table_programs import PROGRAMS
 from tests.support.hostile.table_proxies import PROXIES
 from tests.support.hostile.table_requests import REQUESTS
 from tests.support.hostile.table_services import SERVICES
@@ -25,6 +26,7 @@ HOSTILE: tuple[Hostile, ...] = (
     *FILES,
     *UNPACKED,
     *POSES,
+    *PROGRAMS,
     *LENSES,
     *MODELS,
     *DECODERS,

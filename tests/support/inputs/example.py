@@ -26,6 +26,7 @@ CAMERAS = {
     "colmap": "of a COLMAP model",
     "transforms": "of transforms.json",
     "blender": "of a Blender data set",
+    "program": "of another program",
     "sfm": "to be recovered",
 }
 
@@ -89,4 +90,5 @@ def _read(capture: Path, work: Path) -> tuple[int, str, int, list[str]]:
         return len(scene.views), scene.source, masks, [*scene.warnings, *omissions(scene.left_out)]
     prepared = prepare(capture / Role.images, mask_folder(capture), work)
     masks = sum(photo.mask is not None for photo in prepared.photos)
-    return len(prepared.photos), "sfm", masks, [*prepared.warnings, *omissions(prepared.skipped)]
+    unread = posed.without_cameras(capture)
+    return len(prepared.photos), "sfm", masks, [*unread, *prepared.warnings, *omissions(prepared.skipped)]

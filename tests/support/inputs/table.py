@@ -16,8 +16,9 @@ import numpy as np
 from PIL import Image
 
 from tests.support import unmarked_zip
-from tests.support.inputs.example import Example
-from tests.support.posed_sets import COUNT, NAMES, frames, model, photos, transforms, zip_of
+from tests.support.inputs.example import Example, Kind
+from tests.support.posed_sets import COUNT, NAMES, frames, model, photos, transforms, viewmat, zip_of
+from tests.support.program_files import PROGRAMS, SIZE
 
 Make = Callable[[Path], object]
 
@@ -115,6 +116,21 @@ def of_code_page(folder: Path) -> None:
 def colmap(folder: Path, top: str = "") -> None:
     photos(folder / top / "images")
     model(folder / top / "sparse/0")
+
+
+PROGRAM_ANSWERS: dict[str, Kind] = {
+    "Metashape": "used",
+    "RealityScan, CSV": "used",
+    "RealityScan, XMP": "used",
+    "Bundler": "used",
+    "OpenSfM": "used with a remark",
+}
+
+
+def of_program(program: str, folder: Path) -> None:
+    """The file of another program, of OpenSfM with two reconstructions."""
+    photos(folder / "images", size=SIZE)
+    PROGRAMS[program].write(folder, [viewmat(k) for k in range(COUNT)], NAMES)
 
 
 def several_models(folder: Path) -> None:
@@ -303,5 +319,15 @@ EXAMPLES: tuple[Example, ...] = (
     Example("Cameras", "a depth picture beside each photo", with_depth, "used with a remark"),
     Example("Cameras", "a Blender data set with a validation set", blender, "used with a remark"),
     Example("Cameras", "the raw data of Polycam", polycam, "used"),
-    Example("Cameras", "cameras of OpenSfM", with_file("opensfm/reconstruction.json"), "used with a remark"),
+    *(
+        Example("Cameras", f"cameras of {program}", partial(of_program, program), kind)
+        for program, kind in PROGRAM_ANSWERS.items()
+    ),
+    Example(
+        "Cameras",
+        "a reconstruction.json without cameras",
+        with_file("reconstruction.json"),
+        "used with a remark",
+    ),
+    Example("Cameras", "cameras of Meshroom", with_file("scene.sfm"), "used with a remark"),
 )

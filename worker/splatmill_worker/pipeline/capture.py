@@ -48,7 +48,7 @@ def posed_scene(
     capture = zipped.data_set(capture, workdir, cancelled)
     try:
         given = posed.find(capture)
-    except TwoDataSets as error:
+    except (TwoDataSets, posed.TwoFiles) as error:
         raise Refusal(
             "poses_invalid", str(error), advice="Give one data set, or photos without cameras."
         ) from error
@@ -98,4 +98,7 @@ def posed_scene(
         observer,
         None if options.scale is None else known_distance(options.scale),
     )
-    return replace(scene, warnings=(*names_remark(capture), *scene.warnings, *one_place.warning(scene)))
+    unread = posed.without_cameras(capture)
+    return replace(
+        scene, warnings=(*names_remark(capture), *unread, *scene.warnings, *one_place.warning(scene))
+    )

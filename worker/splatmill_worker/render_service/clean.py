@@ -240,7 +240,7 @@ def _scene(capture: Path, model: Path, stack: ExitStack) -> tuple[Scene, bool]:
     """The posed scene of a capture, and whether its cameras are those of the model, in the world of its file."""
     try:
         given, own = posed.find(capture), False
-    except TwoDataSets as error:
+    except (TwoDataSets, posed.TwoFiles) as error:
         raise Refusal("poses_invalid", str(error)) from error
     beside = model.with_name("cameras.zip")
     if given is None and beside.is_file():

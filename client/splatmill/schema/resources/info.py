@@ -76,6 +76,17 @@ class Accepted(Response):
         default_factory=list, description="Names of files in such a folder that are not read as photos."
     )
     unread: list[Unread] = Field(default_factory=list, description="Kinds of files that are not read.")
+    program_files: list[str] = Field(
+        default_factory=list,
+        description="Patterns of the names, in lower case, of files in which other programs may have written cameras.",
+    )
+    camera_lists: list[str] = Field(
+        default_factory=list,
+        description="Patterns of the names, in lower case, of lists that belong to files `*.out` of cameras.",
+    )
+    large_cameras: list[str] = Field(
+        default_factory=list, description="Patterns of `other_cameras` whose files are not uploaded."
+    )
     other_cameras: dict[str, list[str]] = Field(
         default_factory=dict,
         description="Programs whose cameras are not read, with patterns of the names, in lower case, of their files.",

@@ -1,7 +1,8 @@
-"""Captures that bring their cameras: a COLMAP model, transforms.json, or a Blender data set; and their points."""
+"""Captures that bring their cameras: a COLMAP model, transforms.json, or files of other programs; and their points."""
 
 from splatmill_worker.sfm.posed.camera_models import UnreadModel
-from splatmill_worker.sfm.posed.capture import PosedInput, find
+from splatmill_worker.sfm.posed.capture import PosedInput, find, without_cameras
 from splatmill_worker.sfm.posed.points import with_points
+from splatmill_worker.sfm.posed.programs import TwoFiles
 
-__all__ = ["PosedInput", "UnreadModel", "find", "with_points"]
+__all__ = ["PosedInput", "TwoFiles", "UnreadModel", "find", "with_points", "without_cameras"]

@@ -1,5 +1,5 @@
-"""Finds the cameras that a capture brings, in the layouts of COLMAP, nerfstudio, instant-ngp, Blender and
-Polycam."""
+"""Finds the cameras that a capture brings, in the layouts of COLMAP, nerfstudio, instant-ngp, Blender and Polycam, or
+in files of other programs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,15 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from splatmill.data_sets import MODEL_FILES, Cameras, find_cameras, keyframes, walk
+from splatmill.data_sets import (
+    MODEL_FILES,
+    Cameras,
+    find_cameras,
+    keyframes,
+    program_files,
+    unread_cameras,
+    walk,
+)
 from splatmill.schema.files.photos import PHOTO_FORMATS, PHOTO_SUFFIXES
 from splatmill.schema.quantities import listed
 from splatmill_worker.errors import UnusablePicture
@@ -20,8 +28,9 @@ from splatmill_worker.images.masks import unfit
 from splatmill_worker.images.photo_colors import sentences
 from splatmill_worker.images.prepare import names_remark
 from splatmill_worker.scene import Scene, Source, View, without
-from splatmill_worker.sfm.posed import colmap_model, parts, transforms
+from splatmill_worker.sfm.posed import colmap_model, parts, programs, transforms
 from splatmill_worker.sfm.posed.files import ImageFiles
+from splatmill_worker.sfm.posed.programs import ProgramCameras
 
 POSE_FOLDERS = ("poses", "")
 """Folders of a capture in which cameras are looked for, in order."""
@@ -37,6 +46,7 @@ class PosedInput:
     transforms: the transforms*.json files; empty for a COLMAP model.
     notes: sentences for the user about files that are not used.
     warnings: sentences for the user about photos that are not used.
+    program: the cameras of another program; None for the other kinds.
     """
 
     directory: Path
@@ -45,6 +55,7 @@ class PosedInput:
     transforms: tuple[Path, ...]
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+    program: ProgramCameras | None = None
 
     def load(self) -> Scene:
         """The scene with the cameras as they were given.
@@ -56,6 +67,8 @@ class PosedInput:
         files = ImageFiles.under(self.directory)
         if self.models:
             scene = colmap_model.load_largest(self.models, files, self.notes)
+        elif self.program is not None:
+            scene = programs.load(self.program, files, self.notes)
         else:
             scene = transforms.load(self.transforms, self.source, files, self.directory, self.notes)
         scene = _by_transparency(_without_unfit_masks(scene))
@@ -78,7 +91,9 @@ def find(directory: Path) -> PosedInput | None:
     """The cameras in `directory`, in poses/ first; None when there are none.
 
     A COLMAP model is preferred to transforms.json, because it has sparse points as well. The cameras may lie some
-    folders down: see `splatmill.data_sets.find_cameras`. Raises TwoDataSets.
+    folders down: see `splatmill.data_sets.find_cameras`. Those of other programs are used where there are neither.
+
+    Raises TwoDataSets, and TwoFiles.
     """
     for base in (directory / folder for folder in POSE_FOLDERS):
         names = walk(base) if base.is_dir() else []
@@ -87,6 +102,18 @@ def find(directory: Path) -> PosedInput | None:
             continue
         place, notes = directory, []
         warnings = tuple(names_remark(directory))
+        program = programs.find(base, cameras.programs)
+        if not cameras.models and not cameras.transforms:
+            if program is None:
+                continue
+            warnings += (*unread_cameras(names), *programs.unrecognised(base, cameras.programs))
+            return PosedInput(directory, "program", (), (), (), warnings, program)
+        if program is not None:
+            preferred = cameras.models[:1] or cameras.transforms[:1]
+            own = program.paths[0].name
+            warnings += (
+                f"The cameras of {program.kind.program} in {own} are not used, but those in {preferred[0]}.",
+            )
         if base == directory and cameras.top:
             notes = [f"The cameras are those in {cameras.top}."]
             photos = [name for name in names if Path(name).suffix.lower() in PHOTO_SUFFIXES]
@@ -114,6 +141,13 @@ def find(directory: Path) -> PosedInput | None:
             place, "blender" if blender else "transforms", (), tuple(used), tuple(notes), warnings
         )
     return None
+
+
+def without_cameras(directory: Path) -> list[str]:
+    """Sentences about the files with cameras in poses/, of a capture in which `find` finds none that are read."""
+    base = directory / POSE_FOLDERS[0]
+    names = walk(base) if base.is_dir() else []
+    return [*unread_cameras(names), *programs.unrecognised(base, program_files(names))]
 
 
 def _belongs(path: Path) -> bool:

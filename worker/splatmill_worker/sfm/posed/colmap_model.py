@@ -18,7 +18,7 @@ from splatmill_worker.scene import Camera, Lens, PointViews, Scene, Source, View
 from splatmill_worker.sfm.posed import model_files
 from splatmill_worker.sfm.posed.encodings import decoded
 from splatmill_worker.sfm.posed.files import ImageFiles, alternatives, instead, missing, none_usable
-from splatmill_worker.sfm.posed.model_files import GivenModel, ModelPoints
+from splatmill_worker.sfm.posed.model_files import GivenImage, GivenModel, ModelPoints
 from splatmill_worker.sfm.posed.one_camera import one_for_each
 
 Integers = npt.NDArray[np.int64]
@@ -88,30 +88,32 @@ def _with(scene: Scene, warnings: tuple[str, ...]) -> Scene:
     return replace(scene, warnings=(*scene.warnings, *warnings))
 
 
-def scene_of_given(model: GivenModel, files: ImageFiles, notes: tuple[str, ...] = ()) -> Scene:
+def scene_of_given(
+    model: GivenModel, files: ImageFiles, notes: tuple[str, ...] = (), *, source: Source = "colmap"
+) -> Scene:
     """The scene of a model that was read; see `load`."""
+    what = f"{model.what[0].upper()}{model.what[1:]}"
     views: dict[int, View] = {}
     lacking: list[tuple[str, str]] = []
     unusable: dict[Path, tuple[str, str]] = {}
     for image_id, image in sorted(model.images.items(), key=lambda item: item[1].name):
         found = files.photo(image.name)
         if found is None:
-            lacking.append((image.name, missing(image.name, files, "the COLMAP model has a camera for it")))
+            lacking.append((image.name, missing(image.name, files, f"{model.what} has a camera for it")))
             continue
         name, path = found
         try:
-            camera = camera_and_lens(image.camera, image.viewmat)
-            views[image_id] = fit_to_file(camera, name, path, files.mask(name))
+            views[image_id] = _view(image, name, path, files.mask(name))
         except UnusablePicture as error:
             unusable[path] = (name, error.reason)
     if not views and unusable:
         raise none_usable(list(unusable.values()))
     if not views:
         if not lacking:
-            raise ValueError("The COLMAP model has no registered photo. Give one that has, or leave it out.")
+            raise ValueError(f"{what} has no registered photo. Give one that has, or leave it out.")
         several = alternatives(first := lacking[0][0], files)
         raise ValueError(
-            f"The COLMAP model names {len(lacking)} photos (such as {first!r}), and the capture has "
+            f"{what} names {len(lacking)} photos (such as {first!r}), and the capture has "
             + (f"several of this name: {several}." if several else f"none of them{instead(files)}.")
             + " Give the photos the names that the model uses."
         )
@@ -121,13 +123,25 @@ def scene_of_given(model: GivenModel, files: ImageFiles, notes: tuple[str, ...] 
     faulty |= {files.photos[name]: fault for name, fault in contradictory}
     used = {view.image for view in views.values()}
     without = [
-        (name, faulty.get(path, "the COLMAP model has no camera for it"))
+        (name, faulty.get(path, f"{model.what} has no camera for it"))
         for name, path in files.photos.items()
         if path not in used and path not in copies and path not in unusable
     ]
     left_out = (*lacking, *unusable.values(), *without)
-    scene = scene_of(model.points, views, source="colmap", left_out=left_out, notes=notes)
+    scene = scene_of(model.points, views, source=source, left_out=left_out, notes=notes)
     return replace(scene, warnings=copy_warnings)
+
+
+def _view(image: GivenImage, name: str, path: Path, mask: Path | None) -> View:
+    """The view of a given photo; see `fit_to_file`. Without a size, both orientations of the photo are tried."""
+    if isinstance(image.camera, pycolmap.Camera):
+        return fit_to_file(camera_and_lens(image.camera, image.viewmat), name, path, mask)
+    stored, upright, _ = decoders.sizes(path, name)
+    view, *other = (
+        fit_to_file(camera_and_lens(image.camera(*size), image.viewmat), name, path, mask)
+        for size in dict.fromkeys((stored, upright))
+    )
+    return replace(view, other=other[0]) if other else view
 
 
 def posed_view(

@@ -20,17 +20,20 @@ Float = npt.NDArray[np.float64]
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 """Turns axes of OpenGL (x right, y up, z backward) into those of OpenCV (x right, y down, z forward), and back."""
 
+_OF_POSES: dict[str, Callable[[Float], npt.NDArray[Any]]] = {
+    "from camera to world with OpenCV axes": lambda given: np.linalg.inv(given),
+    "from world to camera with OpenGL axes": lambda given: FLIP @ given,
+    "from camera to world with OpenGL axes": lambda given: FLIP @ np.linalg.inv(given),
+}
+
 CONVENTIONS: dict[str, dict[str, Callable[[Float], npt.NDArray[Any]]]] = {
     "transform_matrix is from camera to world, with OpenGL axes": {
         "from camera to world with OpenCV axes": lambda given: FLIP @ given,
         "from world to camera with OpenGL axes": lambda given: FLIP @ np.linalg.inv(given) @ FLIP,
         "from world to camera with OpenCV axes": lambda given: np.linalg.inv(given) @ FLIP,
     },
-    "a COLMAP model has poses from world to camera, with OpenCV axes": {
-        "from camera to world with OpenCV axes": lambda given: np.linalg.inv(given),
-        "from world to camera with OpenGL axes": lambda given: FLIP @ given,
-        "from camera to world with OpenGL axes": lambda given: FLIP @ np.linalg.inv(given),
-    },
+    "a COLMAP model has poses from world to camera, with OpenCV axes": _OF_POSES,
+    "the file was read as its program writes it, and another program may have changed it": _OF_POSES,
 }
 """By what a file has: what else its matrices may be, and the function from the matrix that was read to the
 world-to-camera matrix that it then means."""
@@ -41,8 +44,8 @@ CLEARLY = 2.0
 
 def of_source(source: Source) -> str:
     """What the files of a source have: a key of CONVENTIONS."""
-    transforms, model = CONVENTIONS
-    return model if source == "colmap" else transforms
+    transforms, model, program = CONVENTIONS
+    return {"colmap": model, "program": program}.get(source, transforms)
 
 
 def better(

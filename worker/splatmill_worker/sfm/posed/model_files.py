@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -65,11 +66,13 @@ class ModelPoints:
 class GivenImage:
     """A photo of a given model: its name, its camera, and its world-to-camera matrix [4,4].
 
+    The camera is a function of the width and height of the photo where the file does not have these.
+
     In a name that is not UTF-8, other bytes are surrogates: see `encodings.decoded`.
     """
 
     name: str
-    camera: pycolmap.Camera
+    camera: pycolmap.Camera | Callable[[int, int], pycolmap.Camera]
     viewmat: Float
 
 
@@ -78,11 +81,13 @@ class GivenModel:
     """A COLMAP model that came with photos; the images by their ids.
 
     faulty: name, and what is wrong, of the images that are left out.
+    what: the model in a sentence.
     """
 
     images: dict[int, GivenImage]
     points: ModelPoints
     faulty: tuple[tuple[str, str], ...] = ()
+    what: str = "the COLMAP model"
 
 
 def read(folder: Path) -> GivenModel:

@@ -12,6 +12,7 @@ from splatmill_worker.images import prepare
 from splatmill_worker.images.archives.archive import REMARK, Allowance
 from splatmill_worker.images.masks import mask_folder
 from splatmill_worker.sfm.posed.capture import find
+from splatmill_worker.sfm.posed.programs import TwoFiles
 
 
 def data_set(capture: Path, workdir: Path, cancelled: Callable[[], bool] = lambda: False) -> Path:
@@ -47,5 +48,5 @@ def _is_data_set(folder: Path) -> bool:
     masked = (folder / "images").is_dir() and mask_folder(folder) is not None
     try:
         return masked or find(folder) is not None
-    except TwoDataSets:
+    except (TwoDataSets, TwoFiles):
         return True  # whoever reads it says so

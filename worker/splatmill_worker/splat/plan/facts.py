@@ -94,7 +94,7 @@ class Facts:
     width, height: median size of a photo, pixels.
     native_longest: longest side of the largest photo before it was loaded, pixels.
     points: number of points of the reconstruction, those of stereo included.
-    source: where the cameras come from: "sfm", "colmap", "transforms" or "blender".
+    source: where the cameras come from: "sfm", "colmap", "transforms", "blender" or "program".
     transparent: number of photos with transparent pixels.
     masked: number of photos with a mask.
     distorted: number of photos, held-out ones included, whose lens distortion was removed.

@@ -1,7 +1,7 @@
 // The files that were given: which of them belong to the capture, under which names, and what is known of each.
 
 import { namesIn } from "./zip.js";
-import { sort, suffix, withoutTop } from "./kinds.js";
+import { fits, sort, suffix, withoutTop } from "./kinds.js";
 import { onMasks, places, remarks } from "./remarks.js";
 import { verdicts } from "./verdicts.js";
 
@@ -186,7 +186,8 @@ export class Items {
     const own = new Set(items.map((item) => `${item.role}/${item.name}`));
     const others = held.filter((file) => !own.has(`${file.role}/${file.name}`));
     let photos = 0;
-    let posed = others.some(isPose) || items.some((item) => item.kind === "pose" && suffix(item.name) !== ".ply");
+    const isPose = (/** @type {{role: string | null, name: string}} */ file) => holdsCameras(file, this.accepted);
+    let posed = others.some(isPose) || items.some(isPose);
     let known = !others.some((file) => file.role === "images" && this.accepted.archives.includes(suffix(file.name)));
     for (const name of [...items, ...others].filter((file) => file.role === "images").map((file) => suffix(file.name))) {
       if (this.accepted.photos.includes(name)) photos++;
@@ -202,7 +203,12 @@ export class Items {
   }
 }
 
-/** @param {{role: string | null, name: string}} file */
-function isPose(file) {
-  return file.role === "poses" && suffix(file.name) !== ".ply";
+/**
+ * Whether a file may hold cameras that are read.
+ * @param {{role: string | null, name: string}} file
+ * @param {import("./kinds.js").Accepted} accepted
+ */
+function holdsCameras(file, accepted) {
+  const unread = Object.values(accepted.other_cameras).flat();
+  return file.role === "poses" && suffix(file.name) !== ".ply" && !unread.some((pattern) => fits(file.name, pattern));
 }

@@ -20,7 +20,10 @@ import { hasPhotosBeside, named } from "./documents.js";
  * @property {string[]} output_marks
  * @property {string[]} output_media
  * @property {{what: string, suffixes: string[], advice: string}[]} unread
+ * @property {string[]} program_files patterns of names, in lower case, of files that may have cameras of other programs
+ * @property {string[]} camera_lists patterns of the names of lists that belong to some of them
  * @property {Record<string, string[]>} other_cameras patterns of names, in lower case, by program
+ * @property {string[]} large_cameras those of them whose files are not sent
  * @property {number} min_photos that cameras can be recovered from, at least
  * @property {number} min_photo_side pixels
  */
@@ -34,6 +37,7 @@ import { hasPhotosBeside, named } from "./documents.js";
  * @property {Map<string, string>} others paths of pictures that are no photos, with what they are
  * @property {string[]} outputs paths of pictures, videos and zips that are results of Splatmill
  * @property {string} top folder of the data set, with a slash at its end, where it is not the given one
+ * @property {boolean} posed whether there are cameras that may be read
  */
 
 const MODEL_SUFFIXES = [".bin", ".txt"];
@@ -92,9 +96,14 @@ export function sort(paths, accepted, documents = new Map()) {
   const poses = namesOf(cameras, visible);
   const points = named(read, "ply_file_path", cameras.top);
   for (const path of visible) if (points.has(path) && suffix(path) === ".ply") poses.set(path, path.slice(cameras.top.length));
+  const alone = poses.size === 0;
+  const programs = programFiles(visible, accepted);
+  const unread = visible.filter((path) => Object.values(accepted.other_cameras).flat().some((pattern) => fits(path, pattern)));
+  const small = unread.filter((path) => !accepted.large_cameras.some((pattern) => fits(path, pattern)));
+  if (pictures.length) for (const path of [...programs, ...small]) if (!poses.has(path)) poses.set(path, path);
   /** @type {Sorted} */
-  const sorted = { files: [], ignored: [], problem: cameras.problem, named: new Set([...drawn].filter((path) => masks.has(path))), others: new Map(), outputs: [], top: cameras.top };
-  if (!poses.size) {
+  const sorted = { files: [], ignored: [], problem: cameras.problem, named: new Set([...drawn].filter((path) => masks.has(path))), others: new Map(), outputs: [], top: cameras.top, posed: !alone || (pictures.length > 0 && programs.length > 0) };
+  if (alone) {
     const inside = visible.filter((path) => path.startsWith(photoRoot) && isPhoto(path));
     sorted.problem ??= noPhotos(inside, accepted);
     sorted.others = besidePhotos(inside, accepted);
@@ -280,6 +289,23 @@ function namesOf(cameras, paths) {
     }
   }
   return poses;
+}
+
+/**
+ * The paths of files that may have cameras of other programs, and of the lists that belong to them.
+ * @param {string[]} paths
+ * @param {Accepted} accepted
+ */
+function programFiles(paths, accepted) {
+  const patterns = [...accepted.program_files, ...(paths.some((path) => fits(path, "*.out")) ? accepted.camera_lists : [])];
+  return paths.filter((path) => patterns.some((pattern) => fits(path, pattern)));
+}
+
+/** Whether the last part of a path fits a pattern in lower case, in which * stands for any letters. @param {string} path @param {string} pattern */
+export function fits(path, pattern) {
+  const name = path.slice(path.lastIndexOf("/") + 1).toLowerCase();
+  const parts = pattern.split("*").map((part) => part.replace(/[.*+?^${}()|[\]\\]/g, "\\$&"));
+  return new RegExp(`^${parts.join(".*")}$`, "su").test(name);
 }
 
 /** The order of Python's strings. @param {string} one @param {string} other */

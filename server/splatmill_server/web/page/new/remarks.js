@@ -1,7 +1,7 @@
 // Remarks on files before they are sent: those that are not read, and what is probably wrong with masks. The sentences
 // are those of the command line (client/splatmill/transfer/local_capture.py) and of the worker (images/masks.py); tests compare them.
 
-import { MAX_DEPTH, stem, suffix, unmarked } from "./kinds.js";
+import { MAX_DEPTH, fits, stem, suffix, unmarked } from "./kinds.js";
 
 /** Share of the pixels of all photos that masks may hide without a remark. */
 const MOST_HIDDEN = 0.5;
@@ -12,7 +12,7 @@ const MOST_HIDDEN = 0.5;
  * @param {import("./kinds.js").Accepted} accepted
  * @returns {string[]}
  */
-export function remarks({ files, ignored, others }, accepted) {
+export function remarks({ files, ignored, others, posed }, accepted) {
   const said = [];
   const read = new Map(accepted.unread.flatMap((kind) => kind.suffixes.map((ending) => [ending, kind])));
   /** @type {Map<import("./kinds.js").Accepted["unread"][0], string[]>} */
@@ -24,7 +24,7 @@ export function remarks({ files, ignored, others }, accepted) {
   for (const [kind, paths] of unread) {
     said.push(`Not read are ${kind.what}: ${paths[0]}${paths.length > 1 ? ` and ${paths.length - 1} more` : ""}. ${kind.advice}`);
   }
-  if (!files.some(({ role }) => role === "poses")) said.push(...unreadCameras(ignored, accepted));
+  if (!posed) said.push(...unreadCameras([...ignored, ...files.map(({ path }) => path)], accepted));
   const beside = ignored.filter((path) => [...accepted.videos, ...accepted.archives].includes(suffix(path)));
   if (beside.length) said.push(`Videos and zips are not used where there are photos: ${beside.join(", ")}.`);
   for (const what of accepted.unused_folders) {
@@ -42,7 +42,7 @@ export function remarks({ files, ignored, others }, accepted) {
  */
 function unreadCameras(paths, accepted) {
   const recovered = "cameras are recovered from the photos.";
-  const first = (/** @type {string[]} */ patterns) => paths.find((path) => patterns.some((pattern) => fits(path.slice(path.lastIndexOf("/") + 1).toLowerCase(), pattern)));
+  const first = (/** @type {string[]} */ patterns) => paths.find((path) => patterns.some((pattern) => fits(path, pattern)));
   const said = Object.entries(accepted.other_cameras).flatMap(([program, patterns]) => {
     const path = first(patterns);
     return path ? [`The cameras of ${program} in ${path} are not read: ${recovered} To use those, export them from there as a COLMAP model or a transforms.json.`] : [];
@@ -99,10 +99,4 @@ export function onMasks(masks, photos, accepted) {
     said.push(`The masks of ${used.length} of ${photos.length} photos hide ${Math.round(100 * hidden)}% of their pixels. Black hides, and white is trained on: if the masks show in white what they should hide, invert them.`);
   }
   return said;
-}
-
-/** Whether a name fits a pattern in which * stands for any letters. @param {string} name @param {string} pattern */
-function fits(name, pattern) {
-  const [begin, ...rest] = pattern.split("*");
-  return rest.length ? name.startsWith(begin) && name.endsWith(rest[0]) && name.length >= begin.length + rest[0].length : name === pattern;
 }
