@@ -113,13 +113,16 @@ def test_build_and_threads_follow_the_environment_and_the_affinity_mask() -> Non
 def test_denormals_are_flushed_inside_the_kernels_only() -> None:
     """A kernel must not leave its thread's floating-point state to the rest of the process."""
     from splatmill_worker.kernels import ops
+    from splatmill_worker.kernels.cpu.step import Step
+    from splatmill_worker.kernels.records import Rates
     from tests.support.kernels.cases import scene
 
-    first, second = [torch.full((64, 3), 1e-39)], [torch.full((64, 3), 1e-39)]
-    ops.adam_([torch.zeros(64, 3)], [torch.zeros(64, 3)], first, second, [0.1], step=1, backend="cpu")
-    assert not first[0].any()  # 0.9 * 1e-39 is a denormal number as well
-    assert not second[0].any()
     case = scene("state", 40)
+    step = Step(*case.groups())
+    step.replace(step.parameters(), torch.full((40, 59), 1e-39), torch.full((40, 59), 1e-39))
+    image, _, _ = step.forward(*case.camera(), case.width, case.height, degree=3)
+    step.backward_update(torch.zeros_like(image), rates=Rates(0.1, 0.1, 0.1, 0.1, 0.1, 0.1), step=1)
+    assert not any(moment.any() for moment in step.moments())  # 0.9 * 1e-39 is a denormal number as well
     ops.project(*case.groups(), *case.camera(), case.width, case.height, degree=3)
     tiny = torch.tensor([1e-30], dtype=torch.float32)
     assert float(tiny * 1e-10) != 0.0

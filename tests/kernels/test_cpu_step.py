@@ -220,17 +220,6 @@ def test_coefficients_that_are_not_given_are_0(given: int, degree: int) -> None:
     assert torch.equal(few.colors, all16.colors)
 
 
-def test_a_gradient_that_is_not_finite_moves_nothing_and_is_counted() -> None:
-    case = scene("refused", 20)
-    step = make_step(case)
-    step.forward(*case.camera(), case.width, case.height, degree=3)
-    before = step.blocks.clone()
-    d_color = torch.full((case.height, case.width, 3), float("nan"))
-    refused = step.backward_update(d_color, rates=RATES, step=1)
-    assert refused > 0
-    assert torch.equal(step.blocks, before)
-
-
 def test_mask_and_kept_statistics() -> None:
     case = scene("mask", 60)
     photo = photo_of(case)

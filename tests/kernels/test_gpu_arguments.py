@@ -71,23 +71,6 @@ def test_launches_pass_the_declared_types(monkeypatch: pytest.MonkeyPatch) -> No
     loss = ops.loss(color, photo, mask=mask, stats=stats, backend="gpu") + alpha.sum() + depth.sum()
     loss.backward()
     ops.knn(groups[0].detach(), backend="gpu")
-    means = groups[0].detach()
-    moments = [torch.zeros_like(means) for _ in range(2)]
-    seen, last = (
-        torch.ones(6, dtype=torch.bool, device=DEVICE),
-        torch.zeros(6, dtype=torch.int32, device=DEVICE),
-    )
-    ops.adam_(
-        [means],
-        [means],
-        moments[:1],
-        moments[1:],
-        [1e-3],
-        step=1,
-        visible=seen,
-        last_step=last,
-        backend="gpu",
-    )
     step = Step(*case.groups(), where=DEVICE)
     step.train(
         case.viewmat, case.K, photo, degree=0, rates=Rates(0.1, 0.1, 0.1, 0.1, 0.1, 0.1), step=1, mask=mask,

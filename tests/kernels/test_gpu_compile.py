@@ -32,7 +32,7 @@ KERNELS = {
     "project_kernel", "color_backward_kernel", "shape_backward_kernel", "pairs_kernel", "composite_kernel",
     "composite_backward_kernel", "across_kernel", "value_kernel", "down_kernel", "gradient_kernel", "row_stats_kernel",
     "stats_kernel", "scores_kernel",
-    "planes_kernel", "drift_kernel", "adam_kernel", "knn_kernel", "compact_kernel", "over_kernel", "total_kernel",
+    "planes_kernel", "drift_kernel", "knn_kernel", "compact_kernel", "over_kernel", "total_kernel",
 }  # fmt: skip
 
 

@@ -21,8 +21,10 @@ pytest.importorskip(
 )
 
 from splatmill_worker.kernels import ops, reference
+from splatmill_worker.kernels.gpu import adam as gpu_adam
 from splatmill_worker.kernels.gpu import bin as gpu_bin
 from splatmill_worker.kernels.records import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN, Bins, Projected
+from splatmill_worker.kernels.records import GROUPS as PARAMETERS
 from splatmill_worker.kernels.reference.bin import _least as least_of
 from splatmill_worker.kernels.reference.composite import _weights
 from tests.support.kernels.cases import CASES, GROUPS, Case
@@ -425,45 +427,38 @@ def test_loss_with_no_used_pixel_is_zero(device: str) -> None:
 
 
 @BY_DEVICE
-@pytest.mark.parametrize("visible_only", [False, True])
-def test_adam_agrees_with_the_definition(visible_only: bool, device: str) -> None:
-    g = torch.Generator().manual_seed(1)
-    shapes = [(37, 3), (37,), (37, 15, 3)]
-    rates = [1e-2, 5e-2, 1e-3]
-    start = [torch.randn(s, generator=g) for s in shapes]
+@pytest.mark.parametrize("beta2", [0.999, 0.98])
+def test_adam_agrees_with_the_definition(beta2: float, device: str) -> None:
+    """Steps on planes, of which some Gaussians miss one, five, or tens of thousands; two gradients are refused."""
+    random = torch.Generator().manual_seed(1)
+    rates = [1e-2, 5e-3, 1e-3, 5e-2, 2.5e-3, 1e-4]
+    sizes = [*list(PARAMETERS.values())[:-1], 3, 45]
+    start = torch.randn(59, 37, generator=random)
     steps = [
-        ([torch.randn(s, generator=g) * 10.0 ** float(-k) for s in shapes], torch.rand(37, generator=g) < 0.5)
-        for k in range(5)
+        (torch.randn(59, 37, generator=random) * 10.0**-k, torch.rand(37, generator=random) < 0.5)
+        for k in range(7)
     ]
-    steps[2][0][0][4, 1] = float("nan")
-    steps[3][0][1][5] = 1e30  # its square is not finite
+    steps[2][0][1, steps[2][1].nonzero()[0]] = float("nan")
+    steps[3][0][10, steps[3][1].nonzero()[1]] = 1e30  # its square is not finite
     ends, refusals = [], []
     for dtype, backend, where in ways(device):
-        state = [[x.to(where, dtype).clone() for x in group] for group in (start, start, start)]
-        state[1:] = [[torch.zeros_like(x) for x in start_] for start_ in (state[0], state[0])]
-        last = torch.zeros(37, dtype=torch.int32, device=where)
-        refused = []
-        for number, (gradients, shown) in enumerate(steps, 1):
+        params = start.to(where, dtype).clone()
+        m, v = torch.zeros_like(params), torch.zeros_like(params)
+        last, refused = (torch.zeros(n, dtype=torch.int32, device=where) for n in (37, 1))
+        for number, (gradient, shown) in zip((1, 2, 3, 8, 9, 5001, 30001), steps, strict=True):
+            given, seen = gradient.to(where, dtype), shown.to(where)
+            if backend == "gpu":
+                missed = gpu_adam.CatchUp(seen.to(torch.uint8), last, number, beta2)
+                gpu_adam.apply_planes(params, given, m, v, rates, 59, number, beta2, refused, missed)
+                continue
             # float64 holds the square of 1e30; the definition's rule is about float32's.
-            given = [x.to(where, dtype) for x in gradients]
-            if dtype == torch.float64:
-                given = [torch.where(x.abs() < 1e19, x, torch.inf) for x in given]
-            refused.append(
-                ops.adam_(
-                    state[0],
-                    given,
-                    state[1],
-                    state[2],
-                    rates,
-                    step=number,
-                    visible=shown.to(where) if visible_only else None,
-                    last_step=last if visible_only else None,
-                    backend=backend,
-                )
-            )
-        ends.append([x for group in state for x in group])
-        refusals.append(refused)
-    assert refusals[2] == refusals[0]
+            given = given.where(given.abs() < 1e19, torch.inf)
+            p, g, m1, v1 = ([x.t() for x in part.split(sizes)] for part in (params, given, m, v))
+            late = {"visible": seen, "last_step": last}
+            refused += reference.adam_(p, g, m1, v1, rates, step=number, beta2=beta2, **late)
+        ends.append([*(x for part in (params, m, v) for x in part.split(sizes)), last])
+        refusals.append(int(refused))
+    assert refusals == [2, 2, 2]
     for i, (a, b, c) in enumerate(zip(ends[2], ends[1], ends[0], strict=True)):
         close(f"state {i}", a, b, c)
 

@@ -7,20 +7,19 @@ float32). A backend without an op raises NotImplementedError; none is replaced b
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, Literal, cast
 
 import torch
 from torch import Tensor
 
 from . import checks
-from .records import BETA2, LEAST_BETA2, TILE, Bins, Projected
+from .records import TILE, Bins, Projected
 
 __all__ = [
     "Backend",
     "Bins",
     "Projected",
-    "adam_",
     "backend_for",
     "bin",
     "composite",
@@ -156,65 +155,6 @@ def photo_stats(photo: Tensor, *, mask: Tensor | None = None, backend: Backend |
     checks.tensor("photo", photo, (None, None, 3), dtype=torch.uint8, device=photo.device.type)
     _check_mask(mask, photo.shape[0], photo.shape[1], photo.device.type)
     return _op(name, "loss", "photo_stats")(photo, mask=mask)
-
-
-def adam_(
-    params: Sequence[Tensor],
-    grads: Sequence[Tensor],
-    exp_avg: Sequence[Tensor],
-    exp_avg_sq: Sequence[Tensor],
-    rates: Sequence[float],
-    *,
-    step: int,
-    visible: Tensor | None = None,
-    last_step: Tensor | None = None,
-    beta2: float = BETA2,
-    backend: Backend | None = None,
-) -> int:
-    """Take one Adam step in place on groups [N, ...] with a rate each; return how many gradient values were refused.
-
-    step counts from 1. With visible [N] (bool) only those rows move, and first make up for the steps since last_step
-    (int32 [N]), which is updated. beta2, the factor on the second moments, is the same in every step. `reference.adam_`
-    has the definition.
-    """
-    if not len(params) == len(grads) == len(exp_avg) == len(exp_avg_sq) == len(rates):
-        raise ValueError("params, grads, exp_avg, exp_avg_sq, rates: one of each per group")
-    if step < 1:
-        raise ValueError(f"step: counts from 1, got {step}")
-    if not LEAST_BETA2 <= beta2 < 1.0:
-        raise ValueError(f"beta2: expected at least {LEAST_BETA2} and less than 1, got {beta2}")
-    if not params:
-        return 0
-    name = _backend(backend, params[0])
-    kind = _kind(name, params[0])
-    for i, p in enumerate(params):
-        for label, group in (
-            ("params", params),
-            ("grads", grads),
-            ("exp_avg", exp_avg),
-            ("exp_avg_sq", exp_avg_sq),
-        ):
-            # In place: a copy would leave the caller's tensor as it was.
-            checks.tensor(f"{label}[{i}]", group[i], tuple(p.shape), contiguous=True, **kind)
-        if len(p) != len(params[0]):
-            raise ValueError(f"params[{i}]: {len(p)} rows, but params[0] has {len(params[0])}")
-    if visible is not None:
-        checks.tensor(
-            "visible", visible, (len(params[0]),), dtype=torch.bool, contiguous=True, device=kind["device"]
-        )
-        if last_step is None:
-            raise ValueError("last_step: needed with visible, to know how many steps a row missed")
-        checks.tensor(
-            "last_step",
-            last_step,
-            (len(params[0]),),
-            dtype=torch.int32,
-            contiguous=True,
-            device=kind["device"],
-        )
-    op = _op(name, "adam", "adam_")
-    late = {"visible": visible, "last_step": last_step}
-    return cast(int, op(params, grads, exp_avg, exp_avg_sq, rates, step=step, beta2=beta2, **late))
 
 
 def knn(points: Tensor, *, backend: Backend | None = None) -> Tensor:

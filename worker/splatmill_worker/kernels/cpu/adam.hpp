@@ -1,4 +1,4 @@
-// Adam's update of sixteen values (Kingma & Ba 2015), shared by the `adam` op and the fused step.
+// Adam's update of sixteen values (Kingma & Ba 2015).
 //
 // State is float32 and does not underflow: eps = 1e-15 outweighs sqrt(v) from v < 1e-30 down, while float32 holds v to 1e-38; a
 // gradient whose square vanishes moves its parameter by less than a thousandth of the rate. Nor does it overflow: a gradient

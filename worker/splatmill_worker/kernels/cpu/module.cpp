@@ -6,7 +6,6 @@
 
 namespace splatmill {
 
-void bind_adam(nb::module_& m);
 void bind_bin(nb::module_& m);
 void bind_clusters(nb::module_& m);
 void bind_composite(nb::module_& m);
@@ -65,7 +64,6 @@ NB_MODULE(SPLATMILL_MODULE, m) {
       .def_prop_ro(
           "slots", [](const Frame& f) { return f.touches.capacity(); },
           "(tile, Gaussian) pairs that there is room for, at 12 bytes each, and at 64 more once gradients were taken.");
-  bind_adam(m);
   bind_bin(m);
   bind_clusters(m);
   bind_composite(m);

@@ -13,9 +13,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from ..records import BETA1, BETA2, EPS, GROUPS
+from ..records import BETA1, EPS, GROUPS
 from ..reference.adam import MEMORY
-from . import device
 from .argument import Bytes, Float, Floats, Int, Ints
 from .constant import LARGEST, constant
 from .transfer import to_device
@@ -71,36 +70,6 @@ def drift_kernel(
     tl.store(decay1 + i, tl.exp2(LOG2_B1 * missed), mask=here)
     tl.store(decay2 + i, tl.exp2(log2_beta2 * missed), mask=here)
     tl.store(last_step + i, tl.where(shown, step, last), mask=here)
-
-
-@triton.jit
-def adam_kernel(
-    values: Floats, grads: Floats, exp_avg: Floats, exp_avg_sq: Floats, seen: Bytes, travel: Floats, decay1: Floats,
-    decay2: Floats, refused: Ints, count: Int, rate: Float, size: Float, root: Float, keep: Float, add: Float,
-    CHANNELS: tl.constexpr, VISIBLE: tl.constexpr, BLOCK: tl.constexpr,
-):  # fmt: skip
-    """One step on rows [N, CHANNELS]. An entry whose gradient, or its square, is not finite stays and is counted."""
-    e = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    shown = e < count * CHANNELS
-    i = e // CHANNELS
-    if VISIBLE:
-        shown = shown & (tl.load(seen + i, mask=shown, other=0) != 0)
-    p = tl.load(values + e, mask=shown, other=0.0)
-    g = tl.load(grads + e, mask=shown, other=0.0)
-    m = tl.load(exp_avg + e, mask=shown, other=0.0)
-    v = tl.load(exp_avg_sq + e, mask=shown, other=0.0)
-    if VISIBLE:
-        gone = tl.load(travel + i, mask=shown, other=0.0)
-        p -= rate * gone * tl.where(v > 0.0, m / tl.sqrt_rn(v), 0.0)
-        m *= tl.load(decay1 + i, mask=shown, other=1.0)
-        v *= tl.load(decay2 + i, mask=shown, other=1.0)
-    p, m, v, bad = advance(p, g, m, v, rate, size, root, keep, add)
-    tl.store(values + e, p, mask=shown)
-    tl.store(exp_avg + e, m, mask=shown)
-    tl.store(exp_avg_sq + e, v, mask=shown)
-    number = tl.sum((bad & shown).to(tl.int32), axis=0)
-    if number > 0:
-        tl.atomic_add(refused, number)
 
 
 @triton.jit
@@ -173,22 +142,6 @@ def _scale(step: int, beta2: float) -> tuple[float, float, float, float]:
     return 1 / (1 - BETA1**step), 1 / math.sqrt(1 - beta2**step), beta2, 1 - beta2
 
 
-def apply(
-    param: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, rate: float, step: int, beta2: float,
-    refused: Tensor, missed: CatchUp | None,
-) -> None:  # fmt: skip
-    """One step of one contiguous group [N, ...] in place; adds the entries that were refused to refused, int32 [1]."""
-    count = param.shape[0]
-    entries = param.numel()
-    if not entries:
-        return
-    late = (None,) * 4 if missed is None else (missed.seen, missed.travel, missed.decay1, missed.decay2)
-    adam_kernel[(triton.cdiv(entries, 4 * BLOCK),)](
-        param, grad.contiguous(), exp_avg, exp_avg_sq, *late, refused, count, rate, *_scale(step, beta2),
-        CHANNELS=entries // count, VISIBLE=missed is not None, BLOCK=4 * BLOCK,
-    )  # fmt: skip
-
-
 def apply_planes(
     params: Tensor, grads: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, rates: Sequence[float],
     channels: int, step: int, beta2: float, refused: Tensor, missed: CatchUp,
@@ -200,32 +153,3 @@ def apply_planes(
             params, grads, exp_avg, exp_avg_sq, missed.seen, missed.travel, missed.decay1, missed.decay2, refused,
             count, count, channels, *rates, *_scale(step, beta2), BLOCK=BLOCK,
         )  # fmt: skip
-
-
-@torch.no_grad()
-def adam_(
-    params: Sequence[Tensor],
-    grads: Sequence[Tensor],
-    exp_avg: Sequence[Tensor],
-    exp_avg_sq: Sequence[Tensor],
-    rates: Sequence[float],
-    *,
-    step: int,
-    visible: Tensor | None = None,
-    last_step: Tensor | None = None,
-    beta2: float = BETA2,
-) -> int:
-    """One Adam step in place, as `reference.adam_` defines it; returns how many entries were refused.
-
-    Waits for the device, to read that number.
-    """
-    device.require(params[0])
-    refused = torch.zeros(1, dtype=torch.int32, device=params[0].device)
-    missed = None
-    if visible is not None:
-        if last_step is None:
-            raise ValueError("last_step: needed with visible, to know how many steps a row missed")
-        missed = CatchUp(visible.to(torch.uint8), last_step, step, beta2)
-    for p, g, m, v, rate in zip(params, grads, exp_avg, exp_avg_sq, rates, strict=True):
-        apply(p, g, m, v, rate, step, beta2, refused, missed)
-    return int(refused)

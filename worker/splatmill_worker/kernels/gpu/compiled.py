@@ -105,7 +105,6 @@ def variants() -> Iterator[Variant]:
     yield Variant(step.scores_kernel, {"BLOCK": step.SCORES_BLOCK}, settings=warps)
     yield Variant(adam.planes_kernel, {"BLOCK": adam.BLOCK}, settings=warps)
     yield Variant(adam.drift_kernel, {"BLOCK": adam.BLOCK}, settings=warps)
-    yield Variant(adam.adam_kernel, {"CHANNELS": 3, "VISIBLE": True, "BLOCK": 4 * adam.BLOCK}, settings=warps)
     yield Variant(knn.knn_kernel, {"ROWS": knn.ROWS, "OTHERS": knn.OTHERS}, settings=warps)
 
 
