@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import redis
 import structlog
+from structlog.testing import CapturingLogger
 
 from splatmill.backplane.connection import connect
 from splatmill_server.base.settings import Settings
@@ -63,3 +64,18 @@ def serve(redis_url: str, connection: redis.Redis, tmp_path: Path) -> Iterator[S
 def app(serve: Serve) -> ServedApp:
     """The app with its default settings."""
     return serve()
+
+
+@pytest.fixture
+def lines() -> Iterator[CapturingLogger]:
+    """Everything that is logged, as dictionaries."""
+    before = structlog.get_config()
+    captured = CapturingLogger()
+    structlog.configure(
+        processors=[structlog.stdlib.add_log_level, lambda _, __, found: ((), found)],
+        wrapper_class=structlog.make_filtering_bound_logger(logging.DEBUG),
+        logger_factory=lambda *_: captured,
+        cache_logger_on_first_use=False,
+    )
+    yield captured
+    structlog.configure(**before)

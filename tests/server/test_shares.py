@@ -6,15 +6,12 @@ Not proved here: the pages of a link in a browser (tests/browser), renders of a 
 from __future__ import annotations
 
 import json
-import logging
 import re
-from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import httpx
 import pytest
-import structlog
 from structlog.testing import CapturingLogger
 
 from splatmill.backplane.storage import layout
@@ -40,21 +37,6 @@ def stranger(app: ServedApp) -> Any:
     """Somebody without a key."""
     with httpx.Client(base_url=app.http.base_url) as http:
         yield http
-
-
-@pytest.fixture
-def lines() -> Iterator[CapturingLogger]:
-    """Everything that is logged, as dictionaries."""
-    before = structlog.get_config()
-    captured = CapturingLogger()
-    structlog.configure(
-        processors=[lambda _, __, found: ((), found)],
-        wrapper_class=structlog.make_filtering_bound_logger(logging.DEBUG),
-        logger_factory=lambda *_: captured,
-        cache_logger_on_first_use=False,
-    )
-    yield captured
-    structlog.configure(**before)
 
 
 def share(app: ServedApp, model_id: str = MODEL, **body: Any) -> dict[str, Any]:

@@ -1,7 +1,8 @@
-"""Decoding processes that can also be asked for the acts of `forbidden_acts`."""
+"""Decoding processes: those of this process, and such as can also be asked for the acts of `forbidden_acts`."""
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -33,3 +34,13 @@ def acts(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
         if callable(value) and getattr(value, "__module__", None) == forbidden_acts.__name__:
             monkeypatch.setattr(value, "__module__", "splatmill_worker.acts")
     return forbidden_acts
+
+
+def children() -> list[int]:
+    """The ids of this process's decoding processes."""
+    found = Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
+    return [
+        pid
+        for pid in map(int, found)
+        if b"images.decoding.decoder" in Path(f"/proc/{pid}/cmdline").read_bytes()
+    ]

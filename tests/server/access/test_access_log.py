@@ -1,10 +1,8 @@
 """The access log: who, what, status, seconds, bytes and request id, one line a request, which a setting turns off."""
 
-import logging
 from typing import Any
 
 import pytest
-import structlog
 from structlog.testing import CapturingLogger
 
 from splatmill.backplane.jobs.row import request_of
@@ -14,23 +12,10 @@ from tests.support.served_app import Serve
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture
-def lines() -> Any:
-    """What is logged at the level info and above, as dictionaries."""
-    before = structlog.get_config()
-    captured = CapturingLogger()
-    structlog.configure(
-        processors=[structlog.stdlib.add_log_level, lambda _, __, found: ((), found)],
-        wrapper_class=structlog.make_filtering_bound_logger(logging.INFO),
-        logger_factory=lambda *_: captured,
-        cache_logger_on_first_use=False,
-    )
-    yield captured
-    structlog.configure(**before)
-
-
 def requests(captured: CapturingLogger) -> list[dict[str, Any]]:
-    return [dict(call.kwargs) for call in captured.calls if call.kwargs.get("event") == "request"]
+    """The lines of requests at the level info, which is the service's."""
+    logged = (dict(call.kwargs) for call in captured.calls)
+    return [line for line in logged if line.get("event") == "request" and line["level"] == "info"]
 
 
 def test_a_request_is_one_line(serve: Serve, lines: CapturingLogger) -> None:

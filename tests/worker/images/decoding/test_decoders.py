@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,6 +18,7 @@ from splatmill_worker.images import examine as examine_here
 from splatmill_worker.images.decoding import decoders
 from splatmill_worker.images.decoding.decoders import Decoders, confined
 from splatmill_worker.images.prepare import prepare
+from tests.support.acting import children
 from tests.support.hostile.videos import video
 from tests.support.waiting import wait_for
 
@@ -130,16 +130,6 @@ def test_no_process_is_left(photos: Path) -> None:
         assert len(children()) == 1
     assert children() == []
     assert decoders.sizes(photos / "deep.png", "deep.png")[0] == (160, 96)  # in this process again
-
-
-def children() -> list[int]:
-    """The ids of this process's decoding processes."""
-    found = Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
-    return [
-        pid
-        for pid in map(int, found)
-        if b"images.decoding.decoder" in Path(f"/proc/{pid}/cmdline").read_bytes()
-    ]
 
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="the processes are found in /proc")

@@ -34,7 +34,7 @@ from splatmill_worker.images.video import video as video_here
 from splatmill_worker.readers import reader_memory
 from splatmill_worker.service.attempts.problems import is_transient, keeps_progress, problem_of
 from splatmill_worker.sfm import posed
-from tests.support.acting import acts
+from tests.support.acting import acts, children
 from tests.support.hostile.videos import video
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="the moments are those of processes of Linux")
@@ -560,13 +560,3 @@ def test_what_a_decoder_says_of_a_file_is_cut(photos: Path, monkeypatch: pytest.
     with confined([photos]), pytest.raises(UnusablePicture) as caught:
         decoders.call(known.answer, photos / "a.png", long.hex(), check=here.picture_of)
     assert len(str(caught.value)) < 2500
-
-
-def children() -> list[int]:
-    """The ids of this process's decoding processes."""
-    found = Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
-    return [
-        pid
-        for pid in map(int, found)
-        if b"images.decoding.decoder" in Path(f"/proc/{pid}/cmdline").read_bytes()
-    ]

@@ -23,6 +23,7 @@ from splatmill_worker.scene import Normalization
 from splatmill_worker.splat.formats import registry
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.start.given_model import read_given_model
+from tests.support.acting import children
 from tests.support.gaussians import some_gaussians
 from tests.support.hostile import model_bombs
 
@@ -35,16 +36,6 @@ pytestmark = [
 def given(path: Path, most: int = 10**6) -> tuple[Gaussians, int]:
     start = read_given_model(path, Normalization(1.0, np.zeros(3)), most)
     return start.gaussians, start.count
-
-
-def children() -> list[int]:
-    """The ids of this process's decoding processes."""
-    found = Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
-    return [
-        pid
-        for pid in map(int, found)
-        if b"images.decoding.decoder" in Path(f"/proc/{pid}/cmdline").read_bytes()
-    ]
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ to be small, so what is about to become the worst is measured again with more.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 
@@ -170,9 +170,6 @@ class Progress:
         self.evaluations += 1
         if not self.points or ratio > self.points[-1][1]:
             self.points.append((self.evaluations, ratio))
-
-
-Objective = Callable[[Family, Numbers], float]
 
 
 def at_random(search: Search, seconds: float, number: int) -> dict[str, Progress]:
