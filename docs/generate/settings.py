@@ -35,9 +35,10 @@ PRESETS = """(presets)=
 ### Presets
 
 What a preset decides, where no other setting does. Training ends once the last doubling of its steps has raised the
-PSNR of [validation photos](../report.md#validation-photos) by less than the gain, and at the latest after the number of
-steps, or after the steps for each photo where these are more. The last columns are the longest side of the photos in
-pixels on each backend.
+PSNR of [validation photos](../report.md#validation-photos) by less than the gain. It is laid out for the number of
+steps, or for the steps for each photo where these are more. Where the last doubling gained as much as the gain, these
+are doubled, twice at most. Captures of fewer than twelve photos spare none to judge by, and keep to the steps. The last
+columns are the longest side of the photos in pixels on each backend.
 """
 
 FIT_IMAGE = """## Fitting one picture

@@ -54,7 +54,14 @@ NAMED: dict[str, dict[str, Forced]] = {
         "steps": Forced({"steps": STEPS}),
         "time": Forced({"time_budget": 600}, {"schedule.budget": Budget(STEPS, 600.0)}),
         "target": Forced({"target_psnr": 45}, {"schedule.budget": ALL}),
-        "flat": Forced(plan={"schedule.budget": ALL, "stops_when_flat": True, "validation": 1}),
+        "flat": Forced(
+            plan={
+                "schedule.budget": ALL,
+                "schedule.longest": 2 * STEPS,
+                "stops_when_flat": True,
+                "validation": 1,
+            }
+        ),
     },
     "image_size": _by_plan("image_size", full=LONGEST, halved=LONGEST // 2),
     "holdout": _by_option("holdout", 0, 8),
@@ -83,6 +90,7 @@ ELSEWHERE = {
             "stops_when_flat",
             "validation",
             "least_gain",
+            "schedule.longest",
         ),
         "end",
     ),

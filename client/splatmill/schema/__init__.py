@@ -63,6 +63,7 @@ if TYPE_CHECKING:
     from splatmill.schema.frames import GeographicOrigin, KnownDistance, ModelFrame, known_distance
     from splatmill.schema.options import (
         PRESET_GAIN,
+        PRESET_LONGEST,
         PRESET_STEPS,
         PRESET_VISITS,
         Backend,
@@ -256,6 +257,7 @@ __all__ = [
     "OUTPUT_MEDIA",
     "PHOTO_SUFFIXES",
     "PRESET_GAIN",
+    "PRESET_LONGEST",
     "PRESET_STEPS",
     "PRESET_VISITS",
     "PROBLEMS",

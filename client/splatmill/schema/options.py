@@ -25,11 +25,15 @@ class Preset(StrEnum):
 
 
 PRESET_STEPS = {Preset.draft: 1000, Preset.balanced: 3000, Preset.quality: 10_000}
-"""Training steps that a preset allows where no budget is given, however few the photos are."""
+"""Training steps that a preset lays out where no budget is given, however few the photos are."""
 
 PRESET_VISITS = {Preset.draft: 12, Preset.balanced: 36, Preset.quality: 120}
-"""Training steps for each photo that a preset allows, where these are more. With the paper's 30,000 steps, each of its
-scenes' 100 to 300 photos comes 100 to 300 times."""
+"""Training steps for each photo that a preset lays out, where these are more. With the paper's 30,000 steps, each of
+its scenes' 100 to 300 photos comes 100 to 300 times."""
+
+PRESET_LONGEST = 4
+"""Largest multiple of its steps that a preset trains: they are doubled while the last doubling gained enough
+(decisions: PRESET_LONGEST)."""
 
 PRESET_GAIN = {Preset.draft: 0.5, Preset.balanced: 0.2, Preset.quality: 0.05}
 """dB on validation photos: a preset ends the training once the last doubling of the steps has gained less
@@ -37,7 +41,7 @@ PRESET_GAIN = {Preset.draft: 0.5, Preset.balanced: 0.2, Preset.quality: 0.05}
 
 
 def preset_steps(preset: Preset, photos: int) -> int:
-    """Return the largest number of steps of a training of so many photos where no budget is given."""
+    """Return the number of steps that a training of so many photos is laid out for where no budget is given."""
     return max(PRESET_STEPS[preset], PRESET_VISITS[preset] * photos)
 
 

@@ -7,7 +7,15 @@ import math
 from collections.abc import Callable, Sequence
 from statistics import median
 
-from splatmill.schema import Backend, Estimate, EstimateJob, StageEstimate, TrainOptions, preset_steps
+from splatmill.schema import (
+    PRESET_LONGEST,
+    Backend,
+    Estimate,
+    EstimateJob,
+    StageEstimate,
+    TrainOptions,
+    preset_steps,
+)
 from splatmill_server.jobs.finished import Figures
 
 ALIKE = 5
@@ -80,13 +88,18 @@ def _training(request: EstimateJob, here: Sequence[Figures]) -> StageEstimate:
     if not alike:
         return StageEstimate(stage="training", because="No such job has finished on this server yet.")
     each = [figures.train / figures.steps * _size_factor(figures, options) for figures in alike]
-    ends_early = options.steps is None or options.target_psnr is not None
-    at_most = ", at most, since training may end earlier" if ends_early else ""
-    return _stage(
+    longest, may = steps, ""
+    if options.steps is None:
+        longest = PRESET_LONGEST * steps
+        may = f", or fewer, or up to {longest} while doubling them gains enough"
+    elif options.target_psnr is not None:
+        may = ", at most, since training may end earlier"
+    stage = _stage(
         "training",
         [min(limit, seconds * steps) for seconds in each],
-        f"{steps} steps{at_most}; {_jobs(alike)} took {_digits(1000 * median(each))} ms per step.",
+        f"{steps} steps{may}; {_jobs(alike)} took {_digits(1000 * median(each))} ms per step.",
     )
+    return stage.model_copy(update={"highest": round(min(limit, max(each) * longest), 1)})
 
 
 def _rest(request: EstimateJob, here: Sequence[Figures]) -> StageEstimate:
@@ -102,7 +115,7 @@ def _rest(request: EstimateJob, here: Sequence[Figures]) -> StageEstimate:
 
 
 def steps_of(options: TrainOptions, photos: int) -> int | None:
-    """Return the largest number of steps that the options allow for so many photos, or None where time limits them."""
+    """Return the number of steps that the options ask for with so many photos, or None where time limits them."""
     if options.steps is not None:
         return options.steps
     if options.time_budget is not None:

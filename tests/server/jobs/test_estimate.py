@@ -55,9 +55,16 @@ def test_stages_are_scaled_by_photos_and_steps() -> None:
     assert seconds({"photos": 200}, job())[1] == 144.0  # 36 steps for each photo
     assert seconds({"photos": 20, "options": {"preset": "draft"}}, job())[1] == 20.0
     assert seconds({"photos": 20, "options": {"steps": 6000}}, job())[1] == 120.0
-    assert (
-        seconds({"photos": 20, "options": {"target_psnr": 30}}, job())[1] == 200.0
-    )  # at most: preset quality
+    assert seconds({"photos": 20, "options": {"target_psnr": 30}}, job())[1] == 200.0  # of the preset quality
+
+
+def test_a_preset_may_take_as_long_as_its_doubled_steps() -> None:
+    for options, highest in (({}, 240.0), ({"target_psnr": 30}, 800.0), ({"steps": 3000}, 60.0)):
+        training = estimate(EstimateJob.model_validate({"photos": 20, "options": options}), [job()]).stages[1]
+        assert (training.lowest, training.highest) == (training.seconds, highest)
+        assert (f"up to {round(highest * 50)} while doubling them gains enough" in training.because) == (
+            "steps" not in options
+        )
 
 
 def test_a_time_budget_is_the_time_of_the_training() -> None:

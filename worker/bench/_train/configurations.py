@@ -75,6 +75,10 @@ CONFIGURATIONS = {
         "all photos from the first step, to the end of the budget",
         plan={"validation": None, "stops_when_flat": False},
     ),
+    "not-doubled": Configuration("the steps of a preset stay as many", plan={"schedule.longest": None}),
+    "late-fall": Configuration(
+        "rates fall after 60 % of the budget, however few the photos", plan={"schedule.annealing.hold": 0.6}
+    ),
     "long-average": Configuration(
         "squared gradients averaged over a thousand steps", plan={"schedule.annealing.beta2": 0.999}
     ),

@@ -22,7 +22,11 @@ def test_without_a_budget_the_steps_follow_the_photos_and_end_by_their_gain(
     for views, steps in ((80, few), (255, many)):
         plan = planned(changed(views=views), preset=preset)
         assert plan.schedule.budget.steps == plan.schedule.expected_steps == steps
-        assert f"for {views} photos, the preset {preset} allows {steps} steps" in plan.reasons["budget"]
+        assert plan.reasons["budget"].endswith(
+            f"for {views} photos, the preset {preset} allows {steps} steps, and doubles them, up to {4 * steps}, while "
+            f"the last doubling gained {gain:g} dB."
+        )
+        assert plan.schedule.longest == 4 * steps
         assert plan.least_gain == gain
         assert f"by less than {gain:g} dB" in plan.reasons["validation"]
 
@@ -31,7 +35,20 @@ def test_the_longest_time_of_a_preset_is_said_before_it_starts() -> None:
     slow = changed(views=300, speed=Speed(2.6e-7, 9e-8))
     midway = (slow.points * planned(slow).max_gaussians) ** 0.5
     minutes = 36 * 300 * (2.6e-7 * slow.pixels + 9e-8 * midway) / 60
-    assert f"10800 steps take about {int(minutes)}m" in planned(slow).reasons["schedule"]
+    said = planned(slow).reasons["schedule"]
+    assert f"10800 steps take about {int(minutes)}m" in said
+    assert f"and 43200 steps {int(4 * minutes)}m" in said
+
+
+def test_only_a_preset_that_photos_judge_is_doubled() -> None:
+    for budget in ({"steps": 3000}, {"time_budget": 60}, {"steps": 700, "target_psnr": 30.0}):
+        assert planned(**budget).schedule.longest is None
+    few = planned(changed(views=11))
+    assert few.schedule.longest is None
+    assert (
+        few.reasons["budget"] == "No budget was given; for 11 photos, the preset balanced allows 3000 steps."
+    )
+    assert planned(changed(views=11), target_psnr=30.0).schedule.longest == 40_000
 
 
 def test_a_target_alone_gets_the_steps_of_the_best_preset() -> None:

@@ -146,6 +146,21 @@ def test_a_time_budget_leaves_the_length_of_steps_to_the_run() -> None:
     assert f"{plan.schedule.expected_steps} steps" in plan.reasons["rates"]
 
 
+def test_the_rates_of_few_photos_fall_once_each_came_a_hundred_times() -> None:
+    for views, budget, hold in (
+        (9, {"steps": 6000}, 0.15),
+        (9, {"steps": 1500}, 0.6),
+        (11, {"steps": 2200}, 0.5),
+        (12, {"steps": 6000}, 0.6),  # here a photo is set aside, which ends what over-fits
+        (9, {"preset": "quality"}, 0.09),
+    ):
+        plan = planned(changed(views=views), **budget)
+        assert plan.schedule.annealing.hold == pytest.approx(hold)
+        assert ("fall from the 100th step on each" in plan.reasons["rates"]) == (hold < Annealing.hold)
+    timed = planned(changed(views=9), time_budget=60)
+    assert timed.schedule.annealing.hold == pytest.approx(900 / timed.schedule.expected_steps)
+
+
 def test_small_photos_are_not_reduced() -> None:
     assert planned().schedule.resolution == ((0, 4), (200, 2), (500, 1))
     assert planned(changed(width=150, height=200)).schedule.resolution == ((0, 2), (500, 1))

@@ -29,19 +29,23 @@ def last_gain(points: list[CurvePoint], since: int = 0) -> float | None:
     return gain_of(validated(points, since))
 
 
-def test_the_best_of_the_second_half_is_compared_with_the_best_before() -> None:
-    assert last_gain(curve(20.0, 24.0, 26.0, 27.0, 27.5, 27.25)) == 1.5
-    assert last_gain(curve(20.0, 28.0, 27.0, 27.0, 27.5, 27.25)) == -0.5
+def test_the_mean_of_the_second_half_is_compared_with_that_of_the_second_quarter() -> None:
+    assert last_gain(curve(20.0, 24.0, 26.0, 27.0, 27.5, 27.25)) == 2.25
+    assert last_gain(curve(40.0, 28.0, 27.0, 27.0, 27.5, 27.25)) == -0.25
+
+
+def test_one_point_that_happens_to_be_high_is_no_loss_of_those_after_it() -> None:
+    assert last_gain(curve(24.0, 25.0, 28.0, 26.75, 27.0, 27.25, 27.0)) == 0.5
 
 
 def test_points_on_all_photos_say_nothing_and_do_not_count() -> None:
-    assert last_gain(curve(20.0, 24.0, 26.0, 27.0, 27.5, 27.25, None)) == 1.5
+    assert last_gain(curve(20.0, 24.0, 26.0, 27.0, 27.5, 27.25, None)) == 2.25
 
 
 def test_points_on_reduced_photos_are_not_compared() -> None:
-    points = curve(29.0, 24.0, 26.0, 27.0, 27.5, 27.25)
-    assert last_gain(points) == -1.5
-    assert last_gain(points, since=100) == 1.5
+    points = curve(20.0, 29.0, 26.0, 27.0, 27.5, 27.25)
+    assert last_gain(points) == -0.25
+    assert last_gain(points, since=200) == 1.25
     assert last_gain(points, since=300) is None
 
 

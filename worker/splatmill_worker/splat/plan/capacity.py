@@ -5,10 +5,18 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from splatmill.schema import PRESET_VISITS, Preset, TrainOptions, format_duration, preset_steps
+from splatmill.schema import (
+    PRESET_LONGEST,
+    PRESET_VISITS,
+    Preset,
+    TrainOptions,
+    format_duration,
+    preset_steps,
+)
 from splatmill_worker.kernels.gpu.device import largest_budget
 from splatmill_worker.splat.plan.budget import Budget
 from splatmill_worker.splat.plan.facts import Facts, Speed
+from splatmill_worker.splat.plan.photos import least_gain
 from splatmill_worker.splat.plan.plan import Kernels, Plan
 from splatmill_worker.splat.plan.reasons import Decision, by_option, switch
 
@@ -25,11 +33,13 @@ class Capacity(NamedTuple):
     max_gaussians: the largest number of Gaussians.
     budget: its limits in steps and seconds.
     steps: the number of steps that the budget is expected to allow.
+    longest: steps up to which the budget is doubled where it proves too short; None: it stays.
     """
 
     max_gaussians: Decision[int]
     budget: Decision[Budget]
     steps: Decision[int]
+    longest: int | None = None
 
 
 def decide_capacity(
@@ -85,17 +95,24 @@ def _max_gaussians(
     )
 
 
-def _budget(facts: Facts, options: TrainOptions, step: float) -> tuple[Decision[Budget], Decision[int]]:
-    """The budget, and the number of steps that it is expected to allow, at `step` seconds each."""
+def _budget(
+    facts: Facts, options: TrainOptions, step: float
+) -> tuple[Decision[Budget], Decision[int], int | None]:
+    """The budget, the number of steps that it is expected to allow, at `step` seconds each, and the longest."""
     if options.time_budget is not None:
-        return _time_budget(facts, options, options.time_budget, step)
+        return *_time_budget(facts, options, options.time_budget, step), None
     if options.steps is not None:
         because = f"The option steps asks for {options.steps} steps."
-        return by_option(Budget(options.steps)), Decision(options.steps, because)
-    steps = preset_steps(options.ending, facts.views)
-    given = f"No budget was given; for {facts.views} photos, the preset {options.ending.value} allows {steps} steps."
-    takes = f"{steps} steps take about {format_duration(steps * step)} on this machine, at most."
-    return Decision(Budget(steps), given), Decision(steps, takes)
+        return by_option(Budget(options.steps)), Decision(options.steps, because), None
+    steps, gain = preset_steps(options.ending, facts.views), least_gain(facts, options)
+    given = f"No budget was given; for {facts.views} photos, the preset {options.ending.value} allows {steps} steps"
+    takes = f"{steps} steps take about {format_duration(steps * step)} on this machine, at most"
+    if not gain:
+        return Decision(Budget(steps), f"{given}."), Decision(steps, f"{takes}."), None
+    longest = PRESET_LONGEST * steps
+    given += f", and doubles them, up to {longest}, while the last doubling gained {gain:g} dB."
+    takes += f", and {longest} steps {format_duration(longest * step)}."
+    return Decision(Budget(steps), given), Decision(steps, takes), longest
 
 
 def _time_budget(

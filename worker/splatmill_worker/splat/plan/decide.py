@@ -11,6 +11,7 @@ from splatmill_worker.splat.plan.culling import decide_culling
 from splatmill_worker.splat.plan.facts import Facts
 from splatmill_worker.splat.plan.needs import FEW_VIEWS, needs_of
 from splatmill_worker.splat.plan.photos import (
+    PHOTOS_PER_VALIDATION,
     decide_antialias,
     decide_background,
     decide_exposure,
@@ -78,6 +79,7 @@ def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
     return Plan(
         schedule=Schedule(
             budget=capacity.budget.value,
+            longest=capacity.longest,
             resolution=_resolution(steps, image_size.value) if coarse.value else ((0, 1),),
             degree=degree.value,
             densify_from=max(50, min(300, steps // 8)),
@@ -209,12 +211,26 @@ def _annealing(facts: Facts, options: TrainOptions, steps: int) -> Decision[Anne
         f"For {steps} steps, squared gradients are averaged over {averaged} of them, and learning "
         f"rates are {boost:.1f} times those of a run of {PAPER_STEPS} steps"
     )
-    if options.time_budget is None:
-        return Decision(Annealing(boost=boost, beta2=beta2), f"{because}.")
+    if options.time_budget is not None:
+        because += "; the factor follows the number of steps that the time allows"
+    hold = _hold(facts, steps)
+    if hold < Annealing.hold:
+        because += (
+            f". With {facts.views} photos, none is set aside to watch for over-fitting, so the rates fall from the "
+            f"{MANY_VISITS}th step on each"
+        )
     return Decision(
-        Annealing(boost=None, beta2=beta2),
-        f"{because}; the factor follows the number of steps that the time allows.",
+        Annealing(boost=boost if options.time_budget is None else None, hold=hold, beta2=beta2), f"{because}."
     )
+
+
+def _hold(facts: Facts, steps: int) -> float:
+    """Share of the budget at full learning rates: where no photo can be set aside, MANY_VISITS steps on each photo at
+    most, since what later steps learn is rather the photos than the scene (decisions: few-photos-rates).
+    """
+    if facts.views >= PHOTOS_PER_VALIDATION:
+        return Annealing.hold
+    return min(Annealing.hold, MANY_VISITS * facts.views / steps)
 
 
 def _dropout(facts: Facts, steps: int) -> Decision[float]:

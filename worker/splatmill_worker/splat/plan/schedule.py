@@ -20,6 +20,7 @@ class Schedule:
     """The course of a run.
 
     budget: its limits in steps and seconds.
+    longest: steps up to which the budget is doubled where it proves too short; None: it stays.
     resolution: pairs of a step and the factor by which photos are reduced after it, until the next pair. Early steps
         gain as much from a small photo as from a large one.
     degree: of the spherical harmonics, from the first step on.
@@ -46,6 +47,7 @@ class Schedule:
     decay_within: float | None = None
     annealing: Annealing = field(default_factory=Annealing)
     dropout: float = 0.0
+    longest: int | None = None
 
     @property
     def reduced_until(self) -> int:

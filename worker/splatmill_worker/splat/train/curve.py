@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from statistics import fmean
 
 GAIN_POINTS = 2
 """Points of the curve that must lie in the second half of the steps. One point is no evidence: the curve dips where
@@ -56,10 +57,12 @@ def validated(curve: Sequence[CurvePoint], since: int = 0) -> list[tuple[int, fl
 
 
 def last_gain(scores: Sequence[tuple[int, float]]) -> float | None:
-    """dB that the best of `validated` scores has gained since half of the steps; None where that is not known yet."""
+    """dB by which the mean of the `validated` scores in the second half of the steps exceeds that in the quarter
+    before; None where it is not known yet (decisions: last-gain).
+    """
     if not scores or scores[-1][0] < GAIN_FROM:
         return None
     half = scores[-1][0] / 2
-    before = [psnr for step, psnr in scores if step <= half]
+    before = [psnr for step, psnr in scores if half / 2 < step <= half]
     after = [psnr for step, psnr in scores if step > half]
-    return max(after) - max(before) if before and len(after) >= GAIN_POINTS else None
+    return fmean(after) - fmean(before) if before and len(after) >= GAIN_POINTS else None

@@ -13,7 +13,7 @@ from splatmill_worker.splat.machine import resident_memory
 from splatmill_worker.splat.train.curve import CurvePoint
 from splatmill_worker.splat.train.renderer import evaluation_background, renderer
 from splatmill_worker.splat.train.run import TrainingRun
-from splatmill_worker.splat.train.stopping import reason_to_stop
+from splatmill_worker.splat.train.stopping import reason_to_stop, still_gains
 from splatmill_worker.splat.views import TrainingView
 
 View = TypeVar("View")
@@ -108,11 +108,7 @@ class Evaluations:
         )
         self.seconds = 0.0
         self.final: FinalScores | None = None
-        # A resumed run is evaluated at the end again: an attempt may die after its last step and before its export.
-        last = run.state.curve[-1] if run.state.curve else None
-        reached = 0.0 if last is None else run.state.budget.progress(last.step, last.seconds)
-        passed = sum(share <= reached for share in self._chosen.shares)
-        self._next = min(passed, len(self._chosen.shares) - 1)
+        self._next = self._after_last()
 
     def is_due(self, run: TrainingRun) -> bool:
         """Whether the next share of the budget is reached, and opacities have recovered from a densification."""
@@ -126,14 +122,30 @@ class Evaluations:
         self._evaluated(self.evaluate(), run.engine)
         run.keep_best()
         run.stopped = reason_to_stop(run)
+        if not run.stopped and self._rates_fall and still_gains(run) and run.double():
+            self._next = self._after_last()
 
     @property
     def decided(self) -> bool:
         """Whether no evaluation to come is one that decides: that at the end does not, and a gain is none while rates
         fall."""
-        plan, shares = self._run.plan, self._chosen.shares
-        last = self._next >= len(shares) - 1
-        return last or (plan.target_psnr is None and shares[self._next] > plan.schedule.annealing.hold)
+        last = self._next >= len(self._chosen.shares) - 1
+        return last or (self._run.plan.target_psnr is None and self._rates_fall)
+
+    @property
+    def _rates_fall(self) -> bool:
+        """Whether rates fall before the next evaluation."""
+        shares = self._chosen.shares
+        return shares[min(self._next, len(shares) - 1)] > self._run.plan.schedule.annealing.hold
+
+    def _after_last(self) -> int:
+        """The index of the share after that of the last point of the curve; a run that ends there has the last one
+        again, since an attempt may die after its last step and before its export.
+        """
+        run, shares = self._run, self._chosen.shares
+        last = run.state.curve[-1] if run.state.curve else None
+        reached = 0.0 if last is None else run.state.budget.progress(last.step, last.seconds)
+        return min(sum(share <= reached for share in shares), len(shares) - 1)
 
     def evaluate(self) -> CurvePoint:
         """Evaluate now; the point is added to the curve of the run."""

@@ -91,7 +91,9 @@ class TrainingRun:
         schedule = self.plan.schedule
         progress = self.progress
         if self.last_good is None or (
-            progress - self.last_good.progress >= SNAPSHOT_SHARE and self.health.near_lowest
+            progress - self.state.budget.progress(self.last_good.state.step, self.last_good.seconds)
+            >= SNAPSHOT_SHARE
+            and self.health.near_lowest
         ):
             self.last_good = self._checked_snapshot()
         self.state.step += 1
@@ -118,11 +120,15 @@ class TrainingRun:
             self._densify()
 
     def rates(self, progress: float) -> Rates:
-        """Learning rates at `progress`, 0 to 1. Under a time budget they are scaled to the measured number of steps."""
-        annealing = self.plan.schedule.annealing
+        """Learning rates at `progress`, 0 to 1. They are scaled to the number of steps: under a time budget to the
+        measured one, and where the budget was doubled to the new one.
+        """
+        annealing, budget = self.plan.schedule.annealing, self.state.budget
         if annealing.boost is None:
-            steps = self.pace.steps(self.state.budget, self.state.step, self.clock.seconds)
+            steps = self.pace.steps(budget, self.state.step, self.clock.seconds)
             annealing = replace(annealing, boost=boost_of(steps))
+        elif budget.steps is not None:
+            annealing = replace(annealing, boost=min(annealing.boost, boost_of(budget.steps)))
         return RateSchedule(self.extent, annealing, self.state.rate_scale).at(progress)
 
     @property
@@ -147,6 +153,15 @@ class TrainingRun:
         """End after another `tail` of what was spent so far: rates fall to their ends in that time."""
         self.state.budget = self.state.budget.ending_at(self.progress, tail)
         self.state.shortened = True
+
+    def double(self) -> bool:
+        """Double the budget, up to the longest that the plan allows; False where it stays as it is."""
+        longest, steps = self.plan.schedule.longest, self.state.budget.steps
+        if longest is None or steps is None or steps >= longest or self.state.shortened:
+            return False
+        self.state.budget = replace(self.state.budget, steps=min(2 * steps, longest))
+        self.health.expect_rise(self.state.step)  # rates rise to those of the longer run
+        return True
 
     def train_on_all(self) -> None:
         """Take steps on the photos that were set aside too: no decision is made by them any more."""

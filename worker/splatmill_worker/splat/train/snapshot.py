@@ -65,11 +65,6 @@ class Snapshot:
     lowest_loss: float = math.inf
     best: Snapshot | None = None
 
-    @property
-    def progress(self) -> float:
-        """Share of the budget that was spent, 0 to 1."""
-        return self.state.budget.progress(self.state.step, self.seconds)
-
     def stored(self) -> Snapshot:
         """The same on the CPU, with no best scene of its own."""
         return replace(

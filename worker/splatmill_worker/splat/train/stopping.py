@@ -34,3 +34,9 @@ def reason_to_stop(run: TrainingRun) -> str:
         elif gain < plan.least_gain:
             run.shorten(FLAT_TAIL)
     return ""
+
+
+def still_gains(run: TrainingRun) -> bool:
+    """Whether the last doubling of the steps gained as much as the plan asks for."""
+    gain = last_gain(run.validated)
+    return gain is not None and gain >= run.plan.least_gain
