@@ -17,7 +17,7 @@ from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.train import checkpoint, curve
 from splatmill_worker.splat.train.loop import Hooks, train
 from splatmill_worker.splat.train.snapshot import Snapshot
-from splatmill_worker.splat.train.stopping import BEST_TAIL
+from splatmill_worker.splat.train.stopping import TAIL
 from tests.support.training import first_engine, plan, split
 
 STEPS = 100
@@ -65,7 +65,7 @@ def test_a_run_that_gets_worse_goes_back_to_its_best_scene_and_ends() -> None:
     assert trained.stopped.startswith(
         f"more steps over-fit, so training went back to the scene after {BEST} steps; "
     )
-    assert trained.steps == (1.0 + BEST_TAIL) * 40 < STEPS
+    assert trained.steps == (1.0 + TAIL) * 40 < STEPS
     best = next(point for point in trained.curve if point.step == BEST)
     assert best.psnr is not None
     assert trained.held_out is not None

@@ -299,9 +299,7 @@ def test_a_run_ends_when_a_doubling_of_its_steps_gains_too_little(
     ended, _, gained = trained.stopped.partition("; ")
     assert float(re.findall(r"the last doubling gained (-?[\d.]+) dB", gained)[0]) > 0.0
     if least:
-        assert trained.steps == round(
-            1.1 * 40
-        )  # after 40 %, where two points of the curve lie in the second half
+        assert trained.steps == 60  # half of 40 more, where two points of the curve lie in the second half
         assert ended == "another doubling of the steps would gain less than 50 dB"
     else:
         assert trained.steps == 100

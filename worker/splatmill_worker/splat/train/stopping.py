@@ -5,11 +5,9 @@ from __future__ import annotations
 from splatmill_worker.splat.train.curve import last_gain
 from splatmill_worker.splat.train.run import TrainingRun
 
-FLAT_TAIL = 0.1
-"""Share of the time spent so far in which the rates fall to their ends once doublings gain too little."""
-
-BEST_TAIL = 0.5
-"""The same after going back to the best scene, which is at most half as old (decisions: best-validated)."""
+TAIL = 0.5
+"""Share of the time spent so far in which the rates fall to their ends once doublings gain too little
+(decisions: best-validated)."""
 
 
 def reason_to_stop(run: TrainingRun) -> str:
@@ -30,9 +28,8 @@ def reason_to_stop(run: TrainingRun) -> str:
     if plan.stops_when_flat and not run.state.shortened and gain is not None:
         if gain < 0.0:
             run.go_back()
-            run.shorten(BEST_TAIL)
-        elif gain < plan.least_gain:
-            run.shorten(FLAT_TAIL)
+        if gain < plan.least_gain:
+            run.shorten(TAIL)
     return ""
 
 
