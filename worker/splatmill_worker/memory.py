@@ -36,7 +36,7 @@ def available() -> int:
     found = [int(psutil.virtual_memory().available)]
     found += [max(0, limit - used) for limit, used in _groups()]
     if (limit := attempt_limit()) is not None:
-        found.append(max(0, limit - int(psutil.Process().memory_info().rss)))
+        found.append(max(0, limit - sum(_memory_of(os.getpid()))))
     return min(found)
 
 

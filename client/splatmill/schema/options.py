@@ -150,8 +150,9 @@ class TrainOptions(Request):
         ge=200 * 10**6,
         le=4 * 10**12,
         description=(
-            "Memory for training: 1.5GB, 2GiB, or a number of bytes. It limits the number of Gaussians. Left "
-            "out, half of the machine's free memory, or the free memory of the GPU."
+            "Memory for training: 1.5GB, 2GiB, or a number of bytes. It limits the number of Gaussians, and photos "
+            "that need more than an eighth of it are kept on the disk. Left out, half of the machine's free memory, or "
+            "the free memory of the GPU."
         ),
         json_schema_extra=_BUDGET | {"kind": "bytes"},
     )

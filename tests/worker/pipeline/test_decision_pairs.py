@@ -22,11 +22,15 @@ from splatmill.schema import Event, Report, TrainOptions
 from splatmill_worker import pipeline
 from splatmill_worker.errors import Refusal
 from splatmill_worker.images.load import Photo, load_views
+from splatmill_worker.images.pixel_files import PixelFiles
+from splatmill_worker.kernels.records import Rates
 from splatmill_worker.pipeline import photos
 from splatmill_worker.scene import Lens, PointViews, Scene, View
 from splatmill_worker.sfm.posed.written import model_of
+from splatmill_worker.splat.engine.protocol import StepResult
 from splatmill_worker.splat.formats import ply
 from splatmill_worker.splat.plan import schedule
+from splatmill_worker.splat.train.run import TrainingRun
 from splatmill_worker.synthetic import orbit, photograph, still_life
 from tests.support import decisions
 from tests.support.pairwise import covering, pairs
@@ -175,6 +179,52 @@ def test_what_cannot_stand_together_is_refused(
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    "row",
+    [
+        {"masks": "some", "exposure": "on"},
+        {"undistortion": "some", "exposure": "on"},
+        {"initial": "hull"},
+    ],
+    ids=lambda row: next(iter(row)),
+)
+def test_photos_in_files_train_the_same_model(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, row: dict[str, str]
+) -> None:
+    """Reduced photos at first, then whole ones, and of all but transparent ones the light is evened: the model, the
+    loss of each step and the scores are the same to the bit.
+    """
+    row = row | {
+        "schedule.resolution": "reduced",
+        "schedule.dropout": "some",
+        "holdout": "8",
+        "backend": "cpu",
+    }
+    found = []
+    step = TrainingRun._step
+    for place, fits in (("memory", True), ("files", False)):
+        losses: list[float] = []
+
+        def watched(self: TrainingRun, index: int, rates: Rates, losses: list[float] = losses) -> StepResult:
+            result = step(self, index, rates)
+            losses.append(result.loss)
+            return result
+
+        monkeypatch.setattr(TrainingRun, "_step", watched)
+        monkeypatch.setattr(photos, "fit_in_memory", lambda photo_bytes, memory, fits=fits: fits)
+        outcome, events, _ = run(folder, tmp_path / place, row)
+        plan = next(event.plan for event in events if event.type == "plan")
+        report = json.loads((outcome.out / "report.json").read_text())
+        assert ("photos_on_disk" in plan["reasons"]) is not fits
+        assert report["facts"]["photos_on_disk"] is not fits
+        assert report["facts"]["photo_bytes"] == 4 * COUNT * WIDTH * HEIGHT
+        scores = [(point["step"], point["psnr"], point["train_psnr"]) for point in report["curve"]]
+        found.append(((outcome.out / "model.ply").read_bytes(), losses, scores))
+        assert len(losses) == decisions.STEPS
+    assert found[0] == found[1]
+
+
+@pytest.mark.slow
 def test_photos_are_held_at_one_size_at_a_time(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -182,9 +232,9 @@ def test_photos_are_held_at_one_size_at_a_time(
     alive: list[weakref.ref[Any]] = []
     counts = []
 
-    def watched(views: Any, size: int) -> list[Photo]:
+    def watched(views: Any, size: int, *, files: PixelFiles | None) -> list[Photo]:
         counts.append((size, sum(each() is not None for each in alive)))
-        photos = [replace(photo, rgb=photo.rgb.copy()) for photo in load_views(views, size)]
+        photos = [replace(photo, rgb=photo.rgb.copy()) for photo in load_views(views, size, files=files)]
         alive.extend(weakref.ref(photo.rgb) for photo in photos)
         return photos
 

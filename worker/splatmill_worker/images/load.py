@@ -20,6 +20,7 @@ from splatmill_worker.images import lens as lenses
 from splatmill_worker.images.decode import Pixels
 from splatmill_worker.images.decoding.decoders import decode
 from splatmill_worker.images.masks import shown_part
+from splatmill_worker.images.pixel_files import PixelFiles
 from splatmill_worker.scene import MIN_SHOWN, Camera, Lens, View
 
 MAX_SAMPLES = 4
@@ -61,17 +62,20 @@ def load_views(
     *,
     background: tuple[float, float, float] | None = None,
     threads: int | None = None,
+    files: PixelFiles | None = None,
 ) -> list[Photo]:
     """Load the photos of `views`, several at a time.
 
     longest_side: in pixels; smaller photos keep their size.
     background: RGB, 0 to 1, behind transparent pixels; None keeps their stored colours.
     threads: photos loaded at a time; None: one per core.
+    files: where pixels are kept; None: in memory.
 
-    Raises UnusablePicture for a file that does not decode, OSError for one that is missing, and ValueError for one
-    whose shape differs from its camera's.
+    Raises UnusablePicture for a file that does not decode, OSError for one that is missing, or for a full disk, and
+    ValueError for one whose shape differs from its camera's.
     """
-    block = _Block([training_size(view.camera.width, view.camera.height, longest_side) for view in views])
+    sizes = [training_size(view.camera.width, view.camera.height, longest_side) for view in views]
+    block = _Block(sizes) if files is None else _Filed(files)
     with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
         return list(
             pool.map(
@@ -81,6 +85,20 @@ def load_views(
                 range(len(views)),
             )
         )
+
+
+class _Filed:
+    """Moves the pixels of photos into files."""
+
+    def __init__(self, files: PixelFiles) -> None:
+        self._files = files
+
+    def moved(self, index: int, photo: Photo) -> Photo:
+        """The photo with its pixels in a file."""
+        alpha, mask = (
+            None if plane is None else self._files.placed(plane) for plane in (photo.alpha, photo.mask)
+        )
+        return replace(photo, rgb=self._files.placed(photo.rgb), alpha=alpha, mask=mask)
 
 
 class _Block:

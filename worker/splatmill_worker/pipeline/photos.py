@@ -2,20 +2,36 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
+from pathlib import Path
 
-from splatmill_worker.images.load import load_views
+from splatmill_worker import memory
+from splatmill_worker.images.load import load_views, training_size
+from splatmill_worker.images.pixel_files import PixelFiles
 from splatmill_worker.pipeline.cameras import Cameras
+from splatmill_worker.pipeline.job import Job
 from splatmill_worker.splat.plan.light import Light
+from splatmill_worker.splat.plan.photos import BYTES_PER_PIXEL, fit_in_memory
 from splatmill_worker.splat.views import TrainingView
 
 
 @dataclass(frozen=True)
 class Photos:
-    """The photos of both parts of the split as tensors, in the training world."""
+    """The photos of both parts of the split as tensors, in the training world.
+
+    training, held_out: the photos.
+    size: of all of them, with a mask or alpha for each, bytes.
+    """
 
     training: tuple[TrainingView, ...]
     held_out: tuple[TrainingView, ...]
+    size: int
+
+    @property
+    def on_disk(self) -> bool:
+        """Whether they lie in files."""
+        return self.training[0].files is not None
 
     @property
     def shown(self) -> TrainingView:
@@ -33,10 +49,39 @@ class Photos:
         return replace(self, training=tuple(view.relit(departure) for view, departure in changes))
 
 
-def load_photos(cameras: Cameras, size: int) -> Photos:
-    """All photos, undistorted, with `size` pixels at most on the longer side."""
+@dataclass(frozen=True)
+class Room:
+    """Where photos may lie.
+
+    memory: that the run may use for all that it does, bytes.
+    folder: for files, of photos that are too large for it.
+    """
+
+    memory: int
+    folder: Path
+
+    @staticmethod
+    def of(job: Job) -> Room:
+        """The room of a job: the memory that is free, and no more than its options allow."""
+        free = memory.available()
+        # For the gpu kernels, the option is about the memory of the card.
+        limit = None if job.kernels == "gpu" else job.options.max_memory
+        return Room(free if limit is None else min(free, limit), job.workdir)
+
+
+def load_photos(cameras: Cameras, size: int, room: Room) -> Photos:
+    """All photos, undistorted, with `size` pixels at most on the longer side; in files where `room` is too small."""
+    pixels = sum(
+        math.prod(training_size(view.camera.width, view.camera.height, size))
+        for view in (*cameras.training, *cameras.held_out)
+    )
+    taken = BYTES_PER_PIXEL * pixels
+    files = None if fit_in_memory(taken, room.memory) else PixelFiles(room.folder)
     training, held_out = (
-        tuple(TrainingView.of(photo, cameras.normalization) for photo in load_views(views, size))
+        tuple(
+            TrainingView.of(photo, cameras.normalization, files)
+            for photo in load_views(views, size, files=files)
+        )
         for views in (cameras.training, cameras.held_out)
     )
-    return Photos(training, held_out)
+    return Photos(training, held_out, taken)

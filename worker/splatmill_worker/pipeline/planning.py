@@ -11,7 +11,7 @@ from splatmill_worker.kernels.gpu.device import describe
 from splatmill_worker.pipeline.cameras import Cameras
 from splatmill_worker.pipeline.first_gaussians import First, first_gaussians
 from splatmill_worker.pipeline.job import Job
-from splatmill_worker.pipeline.photos import Photos, load_photos
+from splatmill_worker.pipeline.photos import Photos, Room, load_photos
 from splatmill_worker.pipeline.stage_times import Stages
 from splatmill_worker.splat.engine.open import open_engine
 from splatmill_worker.splat.plan.capacity import resolved
@@ -34,12 +34,14 @@ class Planned:
     facts: what was measured.
     plan: what was decided.
     photos: at the size of the plan, and in the light that it decides on; None where they are to be loaded smaller.
+    room: for them.
     """
 
     first: First
     facts: Facts
     plan: Plan
     photos: Photos | None
+    room: Room
 
 
 def plan_training(job: Job, cameras: Cameras, revise: Revise, stages: Stages) -> Planned:
@@ -48,14 +50,15 @@ def plan_training(job: Job, cameras: Cameras, revise: Revise, stages: Stages) ->
     Photos of another size than the plan's are freed on return: both sizes at once would be the most memory that photos
     ever take.
     """
+    room = Room.of(job)
     with stages.measured("load"):
-        photos = load_photos(cameras, loading_size(job.options, job.kernels))
+        photos = load_photos(cameras, loading_size(job.options, job.kernels), room)
     with stages.measured("plan"):
         first = first_gaussians(job, cameras, photos)
         facts = _measure_facts(job, cameras, photos, first)
         plan = _make_plan(job, facts, revise)
     smaller = plan.image_size < max(facts.width, facts.height)
-    return Planned(first, facts, plan, None if smaller else _in_light(photos, facts, plan))
+    return Planned(first, facts, plan, None if smaller else _in_light(photos, facts, plan), room)
 
 
 def planned_photos(cameras: Cameras, planned: Planned, stages: Stages) -> Photos:
@@ -63,7 +66,9 @@ def planned_photos(cameras: Cameras, planned: Planned, stages: Stages) -> Photos
     if planned.photos is not None:
         return planned.photos
     with stages.measured("load"):
-        return _in_light(load_photos(cameras, planned.plan.image_size), planned.facts, planned.plan)
+        return _in_light(
+            load_photos(cameras, planned.plan.image_size, planned.room), planned.facts, planned.plan
+        )
 
 
 def _in_light(photos: Photos, facts: Facts, plan: Plan) -> Photos:
@@ -77,7 +82,7 @@ def _measure_facts(job: Job, cameras: Cameras, photos: Photos, first: First) -> 
     most = resolved(pixels, len(photos.training)) if first.model is None else 0
     speed = probe(open_engine(first.gaussians, job.kernels), photos.training, most=most)
     facts = measure(cameras.world, photos.training, len(photos.held_out), speed)
-    facts = replace(facts, start=first.model)
+    facts = replace(facts, start=first.model, photo_bytes=photos.size, photos_on_disk=photos.on_disk)
     if isinstance(first.hull, Hull):
         facts = replace(facts, hull_points=len(first.hull.points))
     elif first.hull is not None:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from splatmill_worker.images.load import Photo
+from splatmill_worker.images.pixel_files import PixelFiles
 from splatmill_worker.scene import Camera, Normalization
 
 Float = npt.NDArray[np.float64]
@@ -58,18 +59,23 @@ class TrainingView:
 
     name: of the photo.
     levels: the photo by the factor that it is reduced by; 1 is the full size, the others are made on first use.
+    files: where the pixels at full size lie; None: in memory. Reduced photos are not kept where it is given.
     """
 
     name: str
     levels: dict[int, Target]
+    files: PixelFiles | None = None
 
     @staticmethod
-    def of(photo: Photo, normalization: Normalization) -> TrainingView:
-        """The photo at full training resolution, with its camera in the training world."""
+    def of(photo: Photo, normalization: Normalization, files: PixelFiles | None = None) -> TrainingView:
+        """The photo at full training resolution, with its camera in the training world.
+
+        files: those that its pixels were loaded into.
+        """
         mask = None if photo.mask is None or photo.mask.all() else torch.from_numpy(photo.mask)
         alpha = None if photo.alpha is None or (photo.alpha == 255).all() else torch.from_numpy(photo.alpha)
         target = _target(normalization.camera(photo.camera), torch.from_numpy(photo.rgb), alpha, mask)
-        return TrainingView(photo.view.name, {1: target})
+        return TrainingView(photo.view.name, {1: target}, files)
 
     @property
     def full(self) -> Target:
@@ -87,19 +93,34 @@ class TrainingView:
         rgb = (target.rgb.float() * factors + 0.5).clamp(0.0, 255.0).to(torch.uint8)
         known = ((target.rgb < CLIPPED) | (factors >= 1.0 - NEGLIGIBLE)).all(dim=2)
         mask = known if target.mask is None else known & target.mask
-        return replace(self, levels={1: target._replace(rgb=rgb, mask=None if bool(mask.all()) else mask)})
+        kept = None if bool(mask.all()) else self._placed(mask)
+        return replace(self, levels={1: target._replace(rgb=self._placed(rgb), mask=kept)})
 
     def reduced(self, factor: int) -> Target:
         """The photo with both sides divided by `factor`, averaged over area, but no side under one pixel."""
-        if factor not in self.levels:
-            self.levels[factor] = _reduced(self.full, factor)
-        return self.levels[factor]
+        if factor in self.levels:
+            return self.levels[factor]
+        target = _reduced(self.full, factor)
+        if self.files is None:
+            self.levels[factor] = target
+        return target
+
+    def read_ahead(self) -> None:
+        """Have the photo read into memory in the background, where it lies in a file."""
+        if self.files is not None:
+            for plane in (self.full.rgb, self.full.alpha, self.full.mask):
+                if plane is not None:
+                    self.files.read_ahead(plane)
 
     def forget_reduced(self) -> None:
         """Free the reduced photos; `reduced` makes them again where they are asked for."""
         full = self.full
         self.levels.clear()
         self.levels[1] = full
+
+    def _placed(self, plane: Tensor) -> Tensor:
+        """The plane of a photo where its pixels lie."""
+        return plane if self.files is None else torch.from_numpy(self.files.placed(plane.numpy()))
 
 
 def _target(camera: Camera, rgb: Tensor, alpha: Tensor | None, mask: Tensor | None) -> Target:

@@ -16,6 +16,7 @@ from splatmill_worker.splat.plan.photos import (
     decide_background,
     decide_exposure,
     decide_image_size,
+    decide_photos_on_disk,
     decide_validation,
     least_gain,
     undistortion,
@@ -53,6 +54,7 @@ def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
         initial = min(initial + added, most)
     decisions: dict[str, Decision[Any]] = {
         "image_size": image_size,
+        "photos_on_disk": decide_photos_on_disk(facts),
         "initial": start,
         "far_shell": needs.far_shell,
         "gaps": needs.gaps,

@@ -112,6 +112,8 @@ class Facts:
     hull_points: number of points on the visual hull of transparent photos; None where training does not start from one.
     no_hull: why the outlines of transparent photos give no hull to start from, a sentence; None where none was carved.
     no_points: why a posed scene has no points, a sentence; None where it has some.
+    photo_bytes: size of all loaded photos, held-out ones included, with a mask or alpha for each; None: not known.
+    photos_on_disk: whether they were loaded into files, since that is more than photos may take of the memory.
     """
 
     views: int
@@ -137,6 +139,8 @@ class Facts:
     no_points: str | None = None
     hull_points: int | None = None
     no_hull: str | None = None
+    photo_bytes: int | None = None
+    photos_on_disk: bool = False
 
     @property
     def pixels(self) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from splatmill.schema import PRESET_GAIN, Background, Preset, Switch, TrainOptions
+from splatmill.schema import PRESET_GAIN, Background, Preset, Switch, TrainOptions, format_bytes
 from splatmill_worker.splat.plan.facts import Facts
 from splatmill_worker.splat.plan.needs import FEW_VIEWS
 from splatmill_worker.splat.plan.plan import Kernels
@@ -42,6 +42,12 @@ MANY_VISITS on they are set aside under a budget as well (decisions: best-valida
 MOST_VALIDATION = 8
 """Photos that are set aside at most: they are measured whole at every point of the curve."""
 
+PHOTO_SHARE = 1 / 8
+"""Share of the memory of a run that photos may take in it (decisions: photos-on-disk)."""
+
+BYTES_PER_PIXEL = 4
+"""Of a photo: three colours, and a mask or alpha."""
+
 DISTANCES_DIFFER = 4.0
 """Ratio of the distances from which the same point is seen, above which Gaussians are anti-aliased."""
 
@@ -49,6 +55,24 @@ DISTANCES_DIFFER = 4.0
 def loading_size(options: TrainOptions, kernels: Kernels) -> int:
     """Longest side, in pixels, at which photos are loaded before their facts are known."""
     return options.image_size or PRESET_SIZE[kernels][options.preset]
+
+
+def fit_in_memory(photo_bytes: int, memory: int) -> bool:
+    """Whether photos of so many bytes lie in memory, of which a run may use `memory` bytes, and not in files."""
+    return photo_bytes <= PHOTO_SHARE * memory
+
+
+def decide_photos_on_disk(facts: Facts) -> Decision[bool]:
+    """Whether photos lie in files. It was decided by `fit_in_memory` before they were loaded; this says why."""
+    if facts.photo_bytes is None:
+        return Decision(facts.photos_on_disk, "")
+    photos = f"{facts.views + facts.held_out} photos take {format_bytes(facts.photo_bytes)}"
+    if not facts.photos_on_disk:
+        return Decision(False, f"{photos}, which memory holds.")
+    return Decision(
+        True,
+        f"{photos}, more than an eighth of the memory. So they lie decoded in files, and steps read them ahead.",
+    )
 
 
 def decide_image_size(facts: Facts, options: TrainOptions) -> Decision[int]:

@@ -88,7 +88,7 @@ def small(view: TrainingView) -> Target:
     kept = set(view.levels)
     target = view.reduced(factor)
     if factor not in kept:
-        del view.levels[factor]
+        view.levels.pop(factor, None)
     return target
 
 

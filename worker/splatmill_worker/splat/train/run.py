@@ -32,6 +32,9 @@ SNAPSHOT_SHARE = 0.04
 MEMORY_SHRINK = 0.8
 """Share of the Gaussians that is kept after memory ran out."""
 
+AHEAD = 8
+"""Photos that are read from the disk while steps are taken on those before them: of a megapixel each, 24 MB."""
+
 STREAM = 1_000_003
 """Steps between the random choices of two seeds of a run: longer than any run."""
 
@@ -104,6 +107,8 @@ class TrainingRun:
                 view.forget_reduced()  # coarse photos do not come again
             self.health.expect_rise(self.state.step)
         index = self._next_view()
+        for coming in reversed(self.state.upcoming[-AHEAD:]):
+            self.views[coming].read_ahead()
         rates = self.rates(progress)
         began = self.clock.seconds
         result = self._step(index, rates)
