@@ -46,6 +46,7 @@ TREES = {
     "raw data of Polycam": "keyframes/images/1.jpg keyframes/cameras/1.json keyframes/corrected_images/1.jpg "
     "keyframes/corrected_cameras/1.json keyframes/depth/1.png mesh_info.json",
     "raw data of Polycam some folders down": "x/Scan/Keyframes/images/1.jpg x/Scan/Keyframes/cameras/1.json x/raw.glb",
+    "cameras beside a video": "clip.mp4 C0001M01.XML cameras.csv",
     "kinds that are not read": "a.jpg b.DNG c.dng old.bmp photos.rar x/VID_1.insv film.mts clip.mp4",
     "cameras that are not read": "images/a.jpg a/scene.SFM scan.nvm b.rd x.mvs temple_par.txt",
     "cameras of other programs": "images/a.jpg images/a.xmp opensfm/Reconstruction.json cameras.XML scan.nvm "

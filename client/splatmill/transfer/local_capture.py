@@ -219,6 +219,11 @@ def find_files(path: str | os.PathLike[str]) -> Found:
         raise NothingToUpload(capture_files.left_out[0][1], "Rename the files.")
     remarks = around + _left_out(unreadable) + unread(ignored) + ([] if posed else unread_cameras(names))
     beside = [name for name in ignored if _suffix(name) in VIDEO_SUFFIXES + ARCHIVE_SUFFIXES]
+    if cameras.programs and not pictures:
+        remarks.append(
+            f"Cameras are read where photos have the names in them; beside a video or a zip these files are not used: "
+            f"{listed(cameras.programs)}."
+        )
     if beside:
         remarks.append(f"Videos and zips are not used where there are photos: {listed(beside)}.")
     remarks += other_remarks(others) + _cameras_beside(root, cameras)

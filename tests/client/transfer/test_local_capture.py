@@ -331,6 +331,8 @@ def test_paths_with_nothing_to_train(tmp_path: Path):
             ["1/2/3/4/5/Transforms.json is not read: cameras are recovered"],
         ),
         (["a.jpg", "notes.txt", "data.json", "x.xml"], []),
+        (["clip.mp4", "C0001M01.XML"], ["beside a video or a zip these files are not used: C0001M01.XML."]),
+        (["more.zip", "cameras.csv"], ["beside a video or a zip these files are not used: cameras.csv."]),
     ],
 )
 def test_what_holds_photos_or_cameras_and_is_not_read_is_said(

@@ -38,6 +38,7 @@ import { hasPhotosBeside, named } from "./documents.js";
  * @property {string[]} outputs paths of pictures, videos and zips that are results of Splatmill
  * @property {string} top folder of the data set, with a slash at its end, where it is not the given one
  * @property {boolean} posed whether there are cameras that may be read
+ * @property {string[]} idle files that may have cameras of other programs, where there are no photos for them
  */
 
 const MODEL_SUFFIXES = [".bin", ".txt"];
@@ -102,7 +103,7 @@ export function sort(paths, accepted, documents = new Map()) {
   const small = unread.filter((path) => !accepted.large_cameras.some((pattern) => fits(path, pattern)));
   if (pictures.length) for (const path of [...programs, ...small]) if (!poses.has(path)) poses.set(path, path);
   /** @type {Sorted} */
-  const sorted = { files: [], ignored: [], problem: cameras.problem, named: new Set([...drawn].filter((path) => masks.has(path))), others: new Map(), outputs: [], top: cameras.top, posed: !alone || (pictures.length > 0 && programs.length > 0) };
+  const sorted = { files: [], ignored: [], problem: cameras.problem, named: new Set([...drawn].filter((path) => masks.has(path))), others: new Map(), outputs: [], top: cameras.top, posed: !alone || (pictures.length > 0 && programs.length > 0), idle: pictures.length ? [] : programs };
   if (alone) {
     const inside = visible.filter((path) => path.startsWith(photoRoot) && isPhoto(path));
     sorted.problem ??= noPhotos(inside, accepted);

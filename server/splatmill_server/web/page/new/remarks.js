@@ -12,7 +12,7 @@ const MOST_HIDDEN = 0.5;
  * @param {import("./kinds.js").Accepted} accepted
  * @returns {string[]}
  */
-export function remarks({ files, ignored, others, posed }, accepted) {
+export function remarks({ files, ignored, others, posed, idle }, accepted) {
   const said = [];
   const read = new Map(accepted.unread.flatMap((kind) => kind.suffixes.map((ending) => [ending, kind])));
   /** @type {Map<import("./kinds.js").Accepted["unread"][0], string[]>} */
@@ -25,6 +25,7 @@ export function remarks({ files, ignored, others, posed }, accepted) {
     said.push(`Not read are ${kind.what}: ${paths[0]}${paths.length > 1 ? ` and ${paths.length - 1} more` : ""}. ${kind.advice}`);
   }
   if (!posed) said.push(...unreadCameras([...ignored, ...files.map(({ path }) => path)], accepted));
+  if (idle.length) said.push(`Cameras are read where photos have the names in them; beside a video or a zip these files are not used: ${idle.join(", ")}.`);
   const beside = ignored.filter((path) => [...accepted.videos, ...accepted.archives].includes(suffix(path)));
   if (beside.length) said.push(`Videos and zips are not used where there are photos: ${beside.join(", ")}.`);
   for (const what of accepted.unused_folders) {
