@@ -3,9 +3,9 @@ SHELL := /bin/bash
 PYTHON ?= python3
 # A folder of photos, a zip, a video or a posed data set; empty: the built-in synthetic scene.
 PHOTOS ?=
-# Where `make demo` leaves its results, and the options of `splatmill train` that it uses.
+# Where `make demo` leaves its results, and the options of `splatmill train` that it uses: a minute is enough for the built-in scene.
 OUT ?= demo
-ARGS ?= --novel-view --orbit
+ARGS ?= --novel-view --orbit $(if $(PHOTOS),,--time-budget 1m)
 # Extra arguments of pip, e.g. PIP_ARGS="--extra-index-url ..." to choose another build of torch.
 PIP_ARGS ?=
 VENV := .venv

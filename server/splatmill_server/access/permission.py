@@ -12,7 +12,7 @@ from splatmill_server.base.problems import ProblemError
 from splatmill_server.base.root_path import own_path
 
 _OPEN = re.compile(
-    r"/|/(healthz|readyz|openapi\.json|docs)|/(jobs|models)(/[^/]*)?|/sign-in|/glossary|/(page|vendor|s)/.*",
+    r"/|/(healthz|readyz|openapi\.json|docs)|/(jobs|models)(/[^/]*)?|/sign-in|/glossary|/open|/(page|vendor|s)/.*",
     re.ASCII,
 )
 

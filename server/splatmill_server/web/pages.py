@@ -66,6 +66,12 @@ def model_page(request: Request, model_id: str) -> Response:
     return page(request, "model/model.html")
 
 
+@router.api_route("/open", methods=_METHODS)
+def open_page(request: Request) -> Response:
+    """The viewer for a model file of the visitor's own, which is not sent to the server."""
+    return page(request, "open/open.html")
+
+
 @router.api_route("/sign-in", methods=_METHODS)
 def sign_in_page(request: Request) -> Response:
     """The page that exchanges a key for a session."""
