@@ -21,6 +21,7 @@ OWN_PATHS = frozenset(
         "jobs",
         "metrics",
         "models",
+        "open",
         "openapi.json",
         "page",
         "readyz",

@@ -13,6 +13,7 @@ from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.records import reason, warn
 from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import CurveRow
+from splatmill_server.jobs.reading import is_deleted
 
 
 def get(connection: redis.Redis, storage: Storage, job_id: str) -> list[CurveRow]:
@@ -31,8 +32,8 @@ def save(connection: redis.Redis, storage: Storage, job_id: str) -> None:
     if not (rows := get(connection, storage, job_id)):
         return
     storage.put(path, "".join(f"{row.model_dump_json(exclude_none=True)}\n" for row in rows).encode())
-    if not connection.exists(keys.job(job_id)):
-        storage.delete(path)  # the job was deleted meanwhile
+    if is_deleted(connection, job_id):
+        storage.delete(path)
 
 
 def _stored(storage: Storage, job_id: str) -> list[CurveRow]:

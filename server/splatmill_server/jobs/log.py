@@ -19,6 +19,7 @@ from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import Job, LogEvent, LogLine
 from splatmill.schema.tolerant import keep_readable
 from splatmill_server.jobs import names
+from splatmill_server.jobs.reading import is_deleted
 
 
 def get(connection: redis.Redis, storage: Storage, job_id: str) -> list[LogLine]:
@@ -51,8 +52,8 @@ def save(connection: redis.Redis, storage: Storage, job: Job, generation: int) -
     head = json.dumps({"format": FORMAT, "generation": generation, "job": ended})
     lines = [line.model_dump_json() for line in get(connection, storage, job.id)]
     storage.put(path, "\n".join([head, *lines, ""]).encode())
-    if not connection.exists(keys.job(job.id)):
-        storage.delete(path)  # the job was deleted meanwhile
+    if is_deleted(connection, job.id):
+        storage.delete(path)
 
 
 @dataclass(frozen=True)

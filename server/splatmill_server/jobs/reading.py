@@ -11,7 +11,7 @@ from splatmill.backplane.jobs.events import StoredEvent
 from splatmill.backplane.jobs.fold import fold
 from splatmill.backplane.jobs.row import JobRow
 from splatmill.backplane.storage.records import UnreadableRecord, warn
-from splatmill.schema import BinKind, Job, JobState
+from splatmill.schema import BinKind, Job, JobState, StoredKind
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,15 @@ class Held:
     def job(self) -> Job:
         """Return the job as clients see it, without links and its place in the queue."""
         return fold(self.row, self.states, self.progress)
+
+
+def is_deleted(connection: redis.Redis, job_id: str) -> bool:
+    """Return whether a job was deleted lately. That its row is missing is not enough: Redis may have lost it."""
+    with connection.pipeline(transaction=False) as pipe:
+        pipe.exists(keys.job(job_id))
+        pipe.exists(keys.deleting(f"{StoredKind.model.value}/{job_id}"))
+        known, marked = pipe.execute()
+    return bool(marked and not known)
 
 
 def read_jobs(

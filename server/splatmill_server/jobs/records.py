@@ -111,15 +111,24 @@ class Jobs:
             # Of two concurrent requests with the same key, only one inserts the job.
             self.connection.transaction(insert, keys.job(job_id), keys.begun_jobs(owner), *watched)
         except BaseException:
-            self.storage.delete(layout.unfinished_job(job_id))
+            self._correct_request(job_id)
             raise
-        if known is not None:
+        if known is not None and (known.capture, known.created_at) != (new.capture, new.created_at):
+            self._correct_request(job_id)
             return self._placed(known), False
+        # Otherwise the row is that of this request, also where a request at the same moment has restored it.
         # A crash here leaves a row that is not in the queue; the reaper enqueues it.
         queue.enqueue(self.connection, job_id, new.generation)
         self.metrics.created.inc()
         log.info("job created", job=job_id, capture=request.capture)
         return self._placed(new), True
+
+    def _correct_request(self, job_id: str) -> None:
+        """Store the row of a job again, where a request that did not make it has just stored its own."""
+        if (made := row.read(self.connection, job_id)) is not None:
+            requests.save(self.storage, made)
+        else:
+            self.storage.delete(layout.unfinished_job(job_id))
 
     def get_id_of_key(self, owner: str, key: str) -> str | None:
         """Return the id of the job that the owner first used an `Idempotency-Key` for, or None."""

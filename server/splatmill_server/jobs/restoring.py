@@ -30,6 +30,11 @@ GRACE = leases.LEASE
 
 _BATCH = 500
 
+_PUT_ROW = """
+if redis.call('EXISTS', KEYS[1]) == 0 then redis.call('HSET', KEYS[1], unpack(ARGV)) end
+"""
+"""Inserts a row, unless there is one: the request that makes the job may just have inserted it."""
+
 
 def make_lists(connection: redis.Redis, storage: Storage, listed: Lists, succeeded: dict[str, Ended]) -> int:
     """List all jobs that have rows, restore those that storage alone knows, and return the number of both.
@@ -73,7 +78,7 @@ def restore_unfinished(connection: redis.Redis, storage: Storage, job_ids: Seque
         return 0
     with connection.pipeline() as pipe:
         for job_row in rows:
-            pipe.hset(keys.job(job_row.id), mapping=cast(Any, job_row.fields()))
+            _put_row(pipe, job_row)
             pipe.hset(keys.latest(job_row.id), keys.SHRUNK, 1)
             created = lists.milliseconds(job_row.created_at)
             lists.put_job(pipe, job_row.id, created, job_row.owner, job_row.capture, lists.UNFINISHED)
@@ -83,6 +88,11 @@ def restore_unfinished(connection: redis.Redis, storage: Storage, job_ids: Seque
         pipe.execute()
     log.warning("jobs that Redis has lost were restored from storage", jobs=len(rows))
     return len(rows)
+
+
+def _put_row(pipe: Any, job_row: JobRow) -> None:
+    fields = [part for field in job_row.fields().items() for part in field]
+    pipe.eval(_PUT_ROW, 1, keys.job(job_row.id), *fields)
 
 
 def _unfinished(storage: Storage, job_id: str, renamed: frozenset[str]) -> JobRow | None:
@@ -193,7 +203,7 @@ def _restore(pipe: Any, added: lists.Additions, job: Job, generation: int) -> No
         cancel_requested_at=ended if job.cancel_requested else None,
         verdict=verdict,
     )
-    pipe.hset(keys.job(job.id), mapping=cast(Any, row.fields()))
+    _put_row(pipe, row)
     pipe.hset(keys.latest(job.id), keys.SHRUNK, 1)
     if job.progress is not None:
         newest = ProgressEvent.model_validate(job.progress.model_dump())

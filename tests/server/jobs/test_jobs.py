@@ -90,9 +90,10 @@ def test_many_requests_at_once_with_one_key_make_one_job(app: ServedApp) -> None
     assert len(made) == 1
     assert [job["id"] for job in app.http.get("/v1/jobs").json()["jobs"]] == list(made)
     captures = app.http.get("/v1/captures").json()["captures"]
-    assert [capture["id"] for capture in captures] == [
-        app.http.get(f"/v1/jobs/{made.pop()}").json()["capture"]
-    ]
+    job = app.http.get(f"/v1/jobs/{made.pop()}").json()
+    assert [capture["id"] for capture in captures] == [job["capture"]]
+    stored = json.loads(app.service.storage.get(layout.unfinished_job(job["id"])))
+    assert stored["capture"] == job["capture"], "a Redis that is lost from here on is filled with it"
 
 
 @pytest.mark.parametrize(

@@ -4,9 +4,12 @@ Not proved here: that a worker takes its lease again (tests/worker/service/test_
 processes (tests/service/test_kills).
 """
 
+import json
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import pytest
+import redis
 
 from splatmill.backplane import keys, lists
 from splatmill.backplane.jobs import row
@@ -25,6 +28,8 @@ from splatmill.schema import (
 )
 from splatmill_server.access.caller import Caller
 from splatmill_server.base.problems import ProblemError
+from splatmill_server.jobs import log as job_log
+from splatmill_server.jobs import restoring
 from tests.support.queue_entries import take, waiting
 from tests.support.served_app import ServedApp, problem
 from tests.support.server_events import brief, follow
@@ -211,3 +216,60 @@ def test_a_cancelled_job_stays_cancelled_where_redis_comes_back_empty_at_once(ap
     app.redis.flushall()
     app.service.reaper.tick()
     assert app.state(job_id) == "cancelled"
+
+
+@pytest.mark.parametrize("stored", [layout.job_log, layout.job_curve])
+def test_a_redis_that_is_emptied_while_the_end_of_a_job_is_stored_loses_nothing(
+    app: ServedApp, monkeypatch: pytest.MonkeyPatch, stored: Callable[[str], str]
+) -> None:
+    job_id = app.job()
+    app.begin(job_id)
+    app.say(
+        job_id, MetricEvent(step=5, seconds=1.0, psnr=20.0, gaussians=7), StateEvent(state=JobState.failed)
+    )
+    put = app.service.storage.put
+
+    def emptied_put(path: str, data: bytes) -> None:
+        put(path, data)
+        if path == stored(job_id):
+            app.redis.flushall()
+
+    monkeypatch.setattr(app.service.storage, "put", emptied_put)
+    app.service.reaper.tick()
+    monkeypatch.undo()
+    app.service.reaper.tick()
+    assert app.service.storage.exists(stored(job_id))
+    assert app.state(job_id) == "failed"
+
+
+def test_a_job_that_is_deleted_while_its_end_is_stored_leaves_nothing(app: ServedApp) -> None:
+    job_id = app.job()
+    app.begin(job_id)
+    app.say(job_id, StateEvent(state=JobState.failed))
+    app.service.reaper.tick()
+    job = app.service.jobs.get(job_id)
+    app.service.deletion.job(job_id)
+    job_log.save(app.redis, app.service.storage, job, 1)
+    assert list(app.service.storage.entries(layout.job(job_id))) == []
+    problem(app.http.get(f"/v1/jobs/{job_id}"), 404, "job_not_found")
+
+
+def test_a_row_that_is_inserted_while_it_is_restored_stays(
+    app: ServedApp, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job_id, other = app.job(), app.capture()
+    inserted: Any = app.redis.hgetall(keys.job(job_id))
+    stored = json.loads(app.service.storage.get(layout.unfinished_job(job_id)))
+    changed = json.dumps(stored | {"capture": other}).encode()
+    app.service.storage.put(layout.unfinished_job(job_id), changed)
+    app.redis.delete(keys.job(job_id))
+    without_row = restoring.without_row
+
+    def late(connection: redis.Redis, job_ids: Sequence[str]) -> list[str]:
+        missing = without_row(connection, job_ids)
+        app.redis.hset(keys.job(job_id), mapping=inserted)
+        return missing
+
+    monkeypatch.setattr(restoring, "without_row", late)
+    app.service.jobs.restore([job_id])
+    assert app.http.get(f"/v1/jobs/{job_id}").json()["capture"] == stored["capture"]
