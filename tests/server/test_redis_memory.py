@@ -56,7 +56,8 @@ def test_a_redis_that_is_nearly_full_is_told_of_before_it_refuses(
     assert "(maxmemory)" in said
     assert "raise maxmemory" in said
     monkeypatch.setenv("REDIS_URL", app.settings.redis_url)
-    warned = [found for found in doctor._redis() if found.verdict == "warning"]
+    # A Redis of the machine may also have a version with known faults, which is another warning.
+    warned = [found for found in doctor._redis() if found.verdict == "warning" and "maxmemory" in found.seen]
     assert len(warned) == 1
     assert "(maxmemory)" in warned[0].seen
     limit(app, 1.2)
