@@ -67,7 +67,8 @@ function begin() {
     refresh();
   });
   again();
-  const button = FINAL.includes(job.state) ? null : notificationButton((on) => (notifies = on));
+  if (FINAL.includes(job.state)) return;
+  const button = notificationButton((on) => (notifies = on));
   byId("notify").replaceChildren(...(button ? [button] : []));
   estimateOf(job).then((known) => {
     estimate = known;

@@ -3,6 +3,7 @@
 import { get, send } from "../api.js";
 import { h } from "../dom.js";
 import { seconds } from "../format.js";
+import { STATES } from "../job_states.js";
 import { notify } from "../shell.js";
 
 /** The states in which each part of an estimate passes. */
@@ -30,7 +31,7 @@ export async function estimateOf(job) {
  */
 export function secondsLeft(course, estimate, now) {
   const spent = course.seconds(now);
-  const states = ["queued", "preparing", "sfm", "training", "exporting"];
+  const states = Object.keys(STATES);
   let sum = 0;
   for (const [part, passing] of Object.entries(PASSES_IN)) {
     if (passing.every((state) => states.indexOf(state) < states.indexOf(course.state))) continue; // it is over
