@@ -7,9 +7,7 @@ from pathlib import Path
 from typing import Any, Self, TypeVar, Unpack
 
 import httpx
-from pydantic import ValidationError
 
-from splatmill.errors import invalid_request
 from splatmill.schema import (
     IDEMPOTENCY_HEADER,
     Capture,
@@ -28,7 +26,6 @@ from splatmill.schema import (
     StorageUse,
     TrainOptions,
 )
-from splatmill.schema.files.formats import is_model_file
 from splatmill.sdk.arguments import TrainArguments
 from splatmill.sdk.bin import AsyncBin
 from splatmill.sdk.imports import AsyncImports
@@ -40,6 +37,7 @@ from splatmill.transfer.connection import RETRIES, TIMEOUT, Connection, read_ans
 from splatmill.transfer.downloads import AnyPath
 from splatmill.transfer.local_capture import find_files, printable, start_model
 from splatmill.transfer.server_choice import Verify
+from splatmill.transfer.training_options import train_options, with_start_model
 from splatmill.transfer.uploads import OnProgress, Uploaded, key_of, upload
 
 PAGE = 100
@@ -325,28 +323,3 @@ class AsyncClient:
             cursor = page.cursor
             if cursor is None:
                 return
-
-
-def with_start_model(options: Mapping[str, Any], folder: AnyPath) -> tuple[dict[str, Any], Path | None]:
-    """Return `options` with the path in `start` replaced by the name of the file in the capture, and that path or None.
-
-    A relative path is looked up in the working folder, then in `folder`, the data set. Raises NothingToUpload where
-    neither holds the file.
-    """
-    start = options.get("start")
-    if start is None or not is_model_file(str(start)):
-        return dict(options), None
-    path = Path(start).expanduser()
-    inside = Path(folder).expanduser() / path
-    if not path.is_file() and inside.is_file():
-        path = inside
-    return {**options, "start": start_model(path).name}, path
-
-
-def train_options(options: Mapping[str, Any]) -> TrainOptions:
-    """Validate options. Raises InvalidRequest, with one clause per value that is not valid."""
-    try:
-        return TrainOptions.model_validate(dict(options))
-    except ValidationError as error:
-        unknown = any(entry["type"] == "extra_forbidden" for entry in error.errors())
-        raise invalid_request(error, "unknown_option" if unknown else "option_out_of_range") from error

@@ -3,6 +3,7 @@
 import http.client
 import importlib.util
 import json
+import math
 import os
 import selectors
 import signal
@@ -62,7 +63,8 @@ class Supervisor:
         worker = [python, "-m", WORKER, "train", "--stop-grace", str(_STOP_GRACE)]
         self.worker = child("worker", worker, _WORKER_STOP_SECONDS)
         renderer = [python, "-m", WORKER, "renderer", "--uds", str(folder.renderer_socket)]
-        self.renderer = child("renderer", renderer, 3.0)
+        # Started once the API answers: nothing is rendered before, and two cores start three programs more slowly.
+        self.renderer = child("renderer", renderer, 3.0, due=math.inf)
         api = [python, "-m", "splatmill_server.up.api", str(listener.fileno())]
         self.api = child("api", api, 6.0, inherited=(listener.fileno(),))
         self.redis: Child | None = None
@@ -98,6 +100,7 @@ class Supervisor:
                 self._tend()
                 if not announced and self._answers():
                     announced = True
+                    self.renderer.due = time.monotonic()
                     ready()
                 if not announced:
                     self._check_start(deadline)

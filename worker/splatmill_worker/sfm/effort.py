@@ -6,7 +6,7 @@ import numpy as np
 
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.errors import SfmFailed
-from splatmill_worker.sfm import checks, features
+from splatmill_worker.sfm import features
 from splatmill_worker.sfm.features import FeatureStore
 from splatmill_worker.sfm.matching import pairs, two_view
 from splatmill_worker.sfm.options import LEAN, Effort
@@ -92,8 +92,8 @@ def _retried(run: SfmRun, result: EffortResult) -> set[int] | None:
     model = result.mapped.largest if result.mapped is not None else None
     reliable = (
         set()
-        if model is None
-        else {features.photo_index(model.images[i].name) for i in checks.reliably_registered(model)}
+        if result.mapped is None or model is None
+        else {features.photo_index(model.images[i].name) for i in result.mapped.reliable}
     )
     unreliable = set(range(run.count)) - reliable
     if not run.scores or len(unreliable) > RETRY_ALL * run.count:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Collection
 from pathlib import Path
 
-from splatmill_worker.sfm import checks
 from splatmill_worker.sfm.mapping import mapper
 from splatmill_worker.sfm.matching import pairs
 from splatmill_worker.sfm.run import SfmRun
@@ -25,7 +24,7 @@ def registered_counts(mapped: mapper.Mapped | None) -> tuple[int, int]:
     """Number of photos registered reliably in the largest model, and number of all those registered in it."""
     if mapped is None:
         return 0, 0
-    return len(checks.reliably_registered(mapped.largest)), mapped.registered
+    return len(mapped.reliable), mapped.registered
 
 
 def best_mapping(run: SfmRun, database: Path, verified: Collection[pairs.Pair]) -> mapper.Mapped:

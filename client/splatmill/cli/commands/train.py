@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -23,8 +23,11 @@ from splatmill.cli.servers import open_client
 from splatmill.errors import JobCancelled, NothingToUpload
 from splatmill.schema import Capture, TrainOptions, format_bytes
 from splatmill.schema.quantities import listed
-from splatmill.sdk.client import Client, JobHandle, ModelHandle
 from splatmill.transfer.local_capture import Found, LocalFile, find_files, printable, start_model
+from splatmill.transfer.training_options import train_options, with_start_model
+
+if TYPE_CHECKING:
+    from splatmill.sdk.client import Client, JobHandle, ModelHandle
 
 DATA = ".splatmill"
 """Name of the folder for the data of a training on this machine, in the folder of its results."""
@@ -94,8 +97,6 @@ def train(
     Without a server, a training that is interrupted (Ctrl-C, kill, power cut) is kept in DIR/.splatmill, and the same
     command continues where it stopped.
     """
-    from splatmill.sdk.aio import train_options, with_start_model
-
     arguments = {key: value for key, value in options.items() if value is not None and value != []}
     if server is None:
         # The embedded service takes this training for a job like any other, but its results have no page.
@@ -127,7 +128,7 @@ def train(
     _announce(capture_files)
     title = name or printable(path.expanduser().resolve().name)
 
-    def outputs(model: ModelHandle) -> None:
+    def outputs(model: "ModelHandle") -> None:
         written = download_files(model, out)
         if novel_view:
             written.append(write_novel_view(model, out / "novel_view.png"))
@@ -144,7 +145,7 @@ def train(
         with open_client(server) as client:
             capture = _upload(client, path, title, start)
 
-            def submit() -> JobHandle:
+            def submit() -> "JobHandle":
                 return client.submit(capture.id, checked, name=title, priority=priority or 0)
 
             if detach:
@@ -172,16 +173,16 @@ def _announce(files: Found) -> None:
 @contextmanager
 def _kept_service(
     data: Path, path: Path, files: list[LocalFile], options: TrainOptions, fresh: bool
-) -> Iterator[tuple[Client, Unfinished]]:
+) -> "Iterator[tuple[Client, Unfinished]]":
     """Run the service on this machine. Its data is removed when the block succeeds, and kept when it raises."""
     with locked(data) as lock:
         unfinished = Unfinished.open(data, path, files, options, fresh=fresh)
         try:
-            with (
-                embedded_service(data, lock) as service,
-                Client(service.url, api_key=service.api_key) as client,
-            ):
-                yield client, unfinished
+            with embedded_service(data, lock) as service:
+                from splatmill.sdk.client import Client
+
+                with Client(service.url, api_key=service.api_key) as client:
+                    yield client, unfinished
         except BaseException:
             if unfinished.trainings:
                 typer.echo(
@@ -196,21 +197,21 @@ def _kept_service(
 
 
 def _train_here(
-    client: Client,
+    client: "Client",
     unfinished: Unfinished,
     path: Path,
     name: str,
     options: TrainOptions,
     start: Path | None,
     verbose: bool,
-) -> ModelHandle:
+) -> "ModelHandle":
     """Go on with the training that an earlier command left, or begin one; return its model."""
     began = datetime.now(UTC)
     unfinished.stop_others(client)
     known = unfinished.capture(client)
     capture = _upload(client, path, name, start, known)
 
-    def job() -> JobHandle:
+    def job() -> "JobHandle":
         if (same := unfinished.job(client)) is not None:
             typer.echo("going on with the training that was stopped")
             return same
@@ -224,7 +225,7 @@ def _train_here(
 
 
 def _upload(
-    client: Client, path: Path, name: str, start: Path | None, known: Capture | None = None
+    client: "Client", path: Path, name: str, start: Path | None, known: Capture | None = None
 ) -> Capture:
     with make_display() as display:
         capture, uploaded = client.upload(
@@ -241,8 +242,8 @@ def _upload(
 
 
 def _follow(
-    start: Callable[[], JobHandle], verbose: bool, cancels: bool = True, since: datetime | None = None
-) -> ModelHandle:
+    start: "Callable[[], JobHandle]", verbose: bool, cancels: bool = True, since: datetime | None = None
+) -> "ModelHandle":
     try:
         return follow_job(start, verbose=verbose, cancels=cancels, since=since)
     except JobCancelled as cancelled:

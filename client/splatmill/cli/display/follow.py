@@ -13,11 +13,14 @@ from dataclasses import dataclass
 from datetime import datetime
 from queue import Empty, SimpleQueue
 from types import FrameType
+from typing import TYPE_CHECKING
 
 from splatmill.cli.display.progress import Display, make_display, show
 from splatmill.errors import Conflict
 from splatmill.schema import EventRecord
-from splatmill.sdk.client import JobHandle, ModelHandle
+
+if TYPE_CHECKING:
+    from splatmill.sdk.client import JobHandle, ModelHandle
 
 SIGNAL_SECONDS = 0.25
 """Longest time for which a signal is not noticed. One that arrives just before a wait in C begins does not end it, nor
@@ -50,8 +53,8 @@ class Interrupted(Exception):
 
 
 def follow_job(
-    start: Callable[[], JobHandle], *, verbose: bool, cancels: bool = True, since: datetime | None = None
-) -> ModelHandle:
+    start: "Callable[[], JobHandle]", *, verbose: bool, cancels: bool = True, since: datetime | None = None
+) -> "ModelHandle":
     """Start a job, show its events until it ends, and return its model.
 
     cancels: the first signal (SIGINT or SIGTERM) cancels the job. Otherwise, it raises Interrupted.
@@ -69,7 +72,7 @@ def follow_job(
 
 
 def _until_ended(
-    job: JobHandle,
+    job: "JobHandle",
     inbox: SimpleQueue[Item],
     display: Display,
     verbose: bool,
@@ -104,7 +107,7 @@ def _next(inbox: SimpleQueue[Item]) -> Item:
             return inbox.get(timeout=SIGNAL_SECONDS)
 
 
-def _read_events(job: JobHandle, inbox: SimpleQueue[Item]) -> None:
+def _read_events(job: "JobHandle", inbox: SimpleQueue[Item]) -> None:
     try:
         for record in job.events():
             inbox.put(record)
@@ -113,7 +116,7 @@ def _read_events(job: JobHandle, inbox: SimpleQueue[Item]) -> None:
         inbox.put(error)
 
 
-def _cancel(job: JobHandle, inbox: SimpleQueue[Item]) -> None:
+def _cancel(job: "JobHandle", inbox: SimpleQueue[Item]) -> None:
     try:
         job.cancel()
     except Conflict:

@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from types import FrameType
 
@@ -58,6 +59,7 @@ def embedded_service(data: Path, lock: int) -> Iterator[ServiceAddress]:
             start_new_session=True,
         )
     try:
+        import_module("splatmill.sdk.client")  # while the service starts: either takes a part of a second
         yield _wait_ready(process, log)
     finally:
         with _signals_hasten(process):

@@ -16,13 +16,15 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from splatmill.errors import Conflict, NotFound, ServiceFailed
 from splatmill.files import atomic_write
 from splatmill.schema import Capture, Role, TrainOptions, format_bytes
-from splatmill.sdk.client import Client, JobHandle
 from splatmill.transfer.local_capture import LocalFile
+
+if TYPE_CHECKING:
+    from splatmill.sdk.client import Client, JobHandle
 
 RECORD = "training.json"
 FORMAT = 1
@@ -102,13 +104,13 @@ class Unfinished:
             )
         return requested
 
-    def stop_others(self, client: Client) -> None:
+    def stop_others(self, client: "Client") -> None:
         """Cancel the jobs of other files or options: else the service would continue them when it starts."""
         for training in self.trainings:
             if training is not self._same():
                 _end(client, training.job)
 
-    def capture(self, client: Client) -> Capture | None:
+    def capture(self, client: "Client") -> Capture | None:
         """Return the newest stored capture that holds none but the files of this command, perhaps not all of them."""
         for capture_id in dict.fromkeys(training.capture for training in reversed(self.trainings)):
             try:
@@ -119,7 +121,7 @@ class Unfinished:
                 return capture
         return None
 
-    def job(self, client: Client) -> JobHandle | None:
+    def job(self, client: "Client") -> "JobHandle | None":
         """Return the job of the same files and options, restarted if it has ended without a model; None without one."""
         same = self._same()
         if same is None:
@@ -174,7 +176,7 @@ def _sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _end(client: Client, job_id: str) -> None:
+def _end(client: "Client", job_id: str) -> None:
     """Cancel a job, if it has not ended, and wait until it has."""
     try:
         job = client.job(job_id)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
 from splatmill_worker.colmap import pycolmap
+from splatmill_worker.sfm import checks
 from splatmill_worker.sfm.callbacks import stop_if
 from splatmill_worker.sfm.mapping.merge import merge
 
@@ -38,6 +40,11 @@ class Mapped:
     def registered(self) -> int:
         """Number of photos registered in the largest model."""
         return self.models[0].num_reg_images() if self.models else 0
+
+    @cached_property
+    def reliable(self) -> frozenset[int]:
+        """Ids of the images that the largest model had registered reliably when this was first asked for."""
+        return frozenset(checks.reliably_registered(self.largest))
 
 
 def run(
