@@ -174,4 +174,4 @@ def test_photos_in_files_take_no_memory(tmp_path: Path) -> None:
     assert size == filed == 60 * 3 * 1200 * 900
     assert total == same
     assert held > 0.9 * size
-    assert taken < 0.1 * size
+    assert taken < 0.2 * size  # eight photos that are read ahead
