@@ -241,16 +241,20 @@ class _Motion:
         middle = flow.mean(axis=(1, 2))
         return bool(np.abs(middle).max() <= 2.0 * SAME and np.abs(flow).max() <= MOST_CROPPED)
 
-    def sampled(self, picture: Grey) -> tuple[Grey, npt.NDArray[np.bool_]]:
-        """The other picture at the places of the pixels of this one, and which of these lie on it, unclipped."""
-        height, width = picture.shape
-        x, y = _grid(picture.shape)
+    def positions(self, shape: tuple[int, ...]) -> tuple[Grey, Grey, npt.NDArray[np.bool_]]:
+        """Rows and columns of the pixels of this picture on the other one, and which of these lie on it."""
+        height, width = shape
+        x, y = _grid(shape)
         right, down = self.flow(x, y)
         half = max(height, width) / 2.0
         column = (x + right) * half + width / 2.0 - 0.5
         row = (y + down) * half + height / 2.0 - 0.5
+        return row, column, (column >= 0) & (column <= width - 1) & (row >= 0) & (row <= height - 1)
+
+    def sampled(self, picture: Grey) -> tuple[Grey, npt.NDArray[np.bool_]]:
+        """The other picture at the places of the pixels of this one, and which of these lie on it, unclipped."""
+        row, column, inside = self.positions(picture.shape)
         values = sampled(picture, row, column)
-        inside = (column >= 0) & (column <= width - 1) & (row >= 0) & (row <= height - 1)
         return values, inside & _unclipped(values)
 
 
@@ -341,13 +345,15 @@ def _aligned(first: Grey, second: Grey, start: _Motion) -> _Motion:
     """
     x, y = (each.ravel() for each in _grid(first.shape))
     ones, squares = np.ones_like(x), x * x + y * y
-    gradients = np.gradient(second)
+    gradients = [np.asarray(each, np.float32) for each in np.gradient(second)]
+    unclipped = _unclipped(first)
     half = max(first.shape) / 2.0
     motion = start
     for _ in range(ROUNDS):
-        warped, known = motion.sampled(second)
-        counted = (known & _unclipped(first)).ravel()
-        down, right = (half * motion.sampled(np.asarray(each, np.float32))[0].ravel() for each in gradients)
+        row, column, inside = motion.positions(second.shape)
+        warped = sampled(second, row, column)
+        counted = (inside & _unclipped(warped) & unclipped).ravel()
+        down, right = (half * sampled(each, row, column).ravel() for each in gradients)
         columns = [
             *(right * each for each in (ones, x, y)),
             *(down * each for each in (ones, x, y)),

@@ -88,7 +88,7 @@ def reprojection_errors(model: pycolmap.Reconstruction) -> dict[int, tuple[int, 
     result = {}
     for image_id in model.reg_image_ids():
         image = model.images[image_id]
-        observed = [point for point in image.points2D if point.has_point3D()]
+        observed = image.get_observation_points2D()
         if not observed:
             result[image_id] = 0, math.inf
             continue

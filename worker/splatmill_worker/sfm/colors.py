@@ -37,7 +37,7 @@ def _observed(
     """Ids of the points that a photo observes, and the photo's colours [n,3] there."""
     image = model.images[image_id]
     camera = model.cameras[image.camera_id]
-    observed = [point for point in image.points2D if point.has_point3D()]
+    observed = image.get_observation_points2D()
     if not observed:
         return [], np.zeros((0, 3), np.uint8)
     factor = min(1.0, SIDE / max(camera.width, camera.height))

@@ -72,7 +72,7 @@ def focal_steps(model: pycolmap.Reconstruction) -> dict[int, float]:
     steps = {}
     for image_id in model.reg_image_ids():
         image = model.images[image_id]
-        observed = [point for point in image.points2D if point.has_point3D()]
+        observed = image.get_observation_points2D()
         if len(observed) < RELIABLE_OBSERVED:
             continue
         local = image.cam_from_world() * np.array([points[point.point3D_id] for point in observed])

@@ -15,6 +15,8 @@ def registered(
 
     camera_id: a new camera for the photos with the ids `images`, which had one camera; it begins with their lens.
     """
+    if camera_id is None and model.num_reg_images() == model.num_images():
+        return copy.deepcopy(model)
     result = pycolmap.Reconstruction()
     for camera in model.cameras.values():
         result.add_camera_with_trivial_rig(camera)
