@@ -241,7 +241,9 @@ class _Motion:
         middle = flow.mean(axis=(1, 2))
         return bool(np.abs(middle).max() <= 2.0 * SAME and np.abs(flow).max() <= MOST_CROPPED)
 
-    def positions(self, shape: tuple[int, ...]) -> tuple[Grey, Grey, npt.NDArray[np.bool_]]:
+    def positions(
+        self, shape: tuple[int, ...]
+    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
         """Rows and columns of the pixels of this picture on the other one, and which of these lie on it."""
         height, width = shape
         x, y = _grid(shape)

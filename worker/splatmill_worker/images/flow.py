@@ -6,6 +6,8 @@ Lucas Kanade feature tracker", 2000.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
@@ -94,7 +96,7 @@ def _window_mean(values: Grey) -> Grey:
     return mean
 
 
-def sampled(picture: Grey, y: Grey, x: Grey) -> Grey:
+def sampled(picture: Grey, y: npt.NDArray[np.floating[Any]], x: npt.NDArray[np.floating[Any]]) -> Grey:
     """A picture [H,W] at fractional pixels, by bilinear interpolation; outside, that of the nearest pixel."""
     height, width = picture.shape
     y, x = np.clip(y, 0, height - 1.001), np.clip(x, 0, width - 1.001)
