@@ -169,7 +169,7 @@ class Step:
         """View [blocks, 16] of the logits of the opacities, to be written to between steps."""
         return self.blocks[:, blocks.FIRST["logit_opacities"], :]
 
-    # Densification scores [N], views but with `clustered`, that add up over steps until `replace` or `clear_scores`.
+    # Densification scores [N], views but with `clustered`, that add up over steps until `replace`.
     # The norm of the gradient is in NDC units (the image is 2 wide and 2 high), as published thresholds are.
 
     @property
@@ -190,10 +190,6 @@ class Step:
     def _score(self, number: int) -> Tensor:
         score = self._scores[number, : self.count]
         return score if self._order is None else torch.empty_like(score).index_copy_(0, self._order, score)
-
-    def clear_scores(self) -> None:
-        """Set the scores to 0."""
-        self._scores.zero_()
 
     # ---- the step
 

@@ -129,7 +129,7 @@ class Step:
     repeated: views rendered again because the first attempt had too little room.
     refused: gradient values that were not finite and were left out, over all steps heard of.
 
-    The scores are views [N] that add up over steps until `replace` or `clear_scores`: `plain_sum`, `visible_count` and
+    The scores are views [N] that add up over steps until `replace`: `plain_sum`, `visible_count` and
     `max_extent`, in the units of `kernels.cpu.step.Step`.
 
     Raises GpuUnavailable where these kernels cannot run, and GpuMemoryShort when memory runs out, with the scene as it
@@ -201,10 +201,6 @@ class Step:
     def logit_opacities(self) -> Tensor:
         """View [1, N] of the logits of the opacities, without the steps missed, to be written to between steps."""
         return self._params[PLANES["logit_opacities"]]
-
-    def clear_scores(self) -> None:
-        """Set the scores to 0."""
-        self._scores.zero_()
 
     def parameters(self) -> dict[str, Tensor]:
         """Return copies [N, ...] of the five groups after all steps, the missed ones included; sh [N, 16, 3]."""
