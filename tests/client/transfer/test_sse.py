@@ -128,7 +128,7 @@ def test_patience_has_an_end(peer, reply, monkeypatch):
     async def run() -> None:
         connection = Connection(peer.url)
         try:
-            async for _ in follow_events(connection, "/v1/jobs/j1/events", give_up=0.05):
+            async for _ in follow_events(connection, "/v1/jobs/j1/events", give_up=1.0):
                 pass
         finally:
             await connection.close()
