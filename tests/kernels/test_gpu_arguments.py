@@ -70,6 +70,7 @@ def test_launches_pass_the_declared_types(monkeypatch: pytest.MonkeyPatch) -> No
     stats = ops.photo_stats(photo, mask=mask, backend="gpu")
     loss = ops.loss(color, photo, mask=mask, stats=stats, backend="gpu") + alpha.sum() + depth.sum()
     loss.backward()
+    ops.median_depth(projected, bins, 17, 5, backend="gpu")
     ops.knn(groups[0].detach(), backend="gpu")
     step = Step(*case.groups(), where=DEVICE)
     step.train(

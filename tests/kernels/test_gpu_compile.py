@@ -33,6 +33,7 @@ KERNELS = {
     "composite_backward_kernel", "across_kernel", "value_kernel", "down_kernel", "gradient_kernel", "row_stats_kernel",
     "stats_kernel", "scores_kernel",
     "planes_kernel", "drift_kernel", "knn_kernel", "compact_kernel", "over_kernel", "total_kernel",
+    "median_depth_kernel",
 }  # fmt: skip
 
 

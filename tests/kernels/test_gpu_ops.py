@@ -28,6 +28,7 @@ from splatmill_worker.kernels.records import GROUPS as PARAMETERS
 from splatmill_worker.kernels.reference.bin import _least as least_of
 from splatmill_worker.kernels.reference.composite import _weights
 from tests.support.kernels.cases import CASES, GROUPS, Case
+from tests.support.kernels.median import agrees, fields_of
 from tests.support.kernels.proof import filled
 
 pytestmark = [
@@ -337,6 +338,19 @@ def test_composite_and_its_gradient_agree_with_the_definition(
         (*Projected._fields[:5], "background"), gradients[2], gradients[1], gradients[0], strict=True
     ):
         close(field, a, b, c, slack=16, roundings=max(64, amplified))
+
+
+@BY_DEVICE
+@pytest.mark.parametrize("name", ["discs", "a block and one", "near plane", "antialias"])
+def test_median_depth_agrees_with_the_definition(name: str, device: str) -> None:
+    case = shrunk(case_for(name, device, 40), device)
+    projected, bins, tilts = fields_of(case)
+    found = ops.median_depth(
+        single(projected, device), Bins(bins.offsets.to(device), bins.ids.to(device)), case.width, case.height,
+        tilts=tilts.to(device), backend="gpu",
+    )  # fmt: skip
+    assert (found > 0).any()
+    agrees(name, case, found.cpu(), projected, bins, tilts)
 
 
 BAD = (float("nan"), float("inf"), float("-inf"), 3.4e38, 1e-45)

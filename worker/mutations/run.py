@@ -55,6 +55,7 @@ PROOFS = {
     "cpu/loss": ["test_loss.py"],
     "cpu/knn": ["test_knn.py"],
     "cpu/correlate": ["test_correlate.py"],
+    "cpu/median_depth": ["test_median_depth.py"],
     "cpu/pose": ["test_cpu_pose.py"],
     "cpu/step": ["test_cpu_step.py", *GRADIENTS],
     "cpu/threads": ["test_cpu_isa.py", "test_proof_poison.py"],
@@ -67,6 +68,7 @@ PROOFS = {
     "reference/adam": ["test_adam.py"],
     "reference/knn": ["test_knn.py"],
     "reference/correlate": ["test_correlate.py"],
+    "reference/median_depth": ["test_median_depth.py"],
     "reference/loss": ["test_loss.py"],
     "gpu/adam": [f"{GPU_OPS}adam_agrees_with_the_definition", "test_gpu_step.py"],
     "gpu/bin": [
@@ -77,6 +79,7 @@ PROOFS = {
     "gpu/blend": [f"{GPU_OPS}composite_and_its_gradient_agree_with_the_definition"],
     "gpu/composite": [f"{GPU_OPS}composite_and_its_gradient_agree_with_the_definition"],
     "gpu/composite_backward": [f"{GPU_OPS}composite_and_its_gradient_agree_with_the_definition"],
+    "gpu/median_depth": [f"{GPU_OPS}median_depth_agrees_with_the_definition"],
     "gpu/photos": ["test_gpu_waiting.py"],
     "gpu/loss": [f"{GPU_OPS}loss_and_its_gradient_agree_with_the_definition"],
     "gpu/knn": [f"{GPU_OPS}knn_agrees_with_the_definition"],

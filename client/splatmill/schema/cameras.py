@@ -158,6 +158,8 @@ class CameraSpec(Request):
 class Output(StrEnum):
     color = "color"
     depth = "depth"
+    median_depth = "median_depth"
+    normal = "normal"
     alpha = "alpha"
 
 
@@ -182,15 +184,17 @@ class RenderRequest(Request):
     output: Output = Field(
         default=Output.color,
         description=(
-            "What is rendered: color, depth (distance along the viewing axis, in units of the model) "
-            "or alpha (opacity)."
+            "What is rendered: color, depth (mean distance along the viewing axis, in units of the model), "
+            "median_depth (that of the first surface, where half of the light is stopped), normal (of the surface, "
+            "in the axes of the model) or alpha (opacity)."
         ),
     )
     format: Format = Field(
         default=Format.png,
         description=(
-            "Format of the image. Depth is a png (16 bit; the header Splatmill-Depth-Scale holds the scale) "
-            "or an npy (float32)."
+            "Format of the image. Depths are a png (16 bit; the header Splatmill-Depth-Scale holds the scale) "
+            "or an npy (float32). In an image, a normal from -1 to 1 is a colour from 0 to 1, and black where "
+            "there is none."
         ),
     )
     background: Color = Field(default="black", description="Colour behind the model.")
@@ -198,7 +202,8 @@ class RenderRequest(Request):
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
-        if self.output is Output.depth and self.format not in (Format.png, Format.npy):
+        depth = self.output in (Output.depth, Output.median_depth)
+        if depth and self.format not in (Format.png, Format.npy):
             raise ValueError(f"Depth cannot be a {self.format.value}; ask for png (16 bit) or npy (float32).")
         if self.output is Output.color and self.format is Format.jpeg and self.background == "transparent":
             raise ValueError(

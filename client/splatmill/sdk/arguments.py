@@ -56,7 +56,7 @@ class TrainArguments(TypedDict, total=False):
 class RenderArguments(TypedDict, total=False):
     """How an image is rendered: the fields of `RenderRequest` but the camera."""
 
-    output: Output | Literal["color", "depth", "alpha"]
+    output: Output | Literal["color", "depth", "median_depth", "normal", "alpha"]
     format: Format | Literal["png", "jpeg", "webp", "npy"]
     background: Literal["black", "white", "transparent"]
     quality: int

@@ -166,6 +166,8 @@ def test_pictures_that_cannot_be():
     camera = camera_of()
     with pytest.raises(ValidationError, match="Depth cannot be a jpeg"):
         RenderRequest(camera=camera, output=Output.depth, format=Format.jpeg)
+    with pytest.raises(ValidationError, match="Depth cannot be a webp"):
+        RenderRequest(camera=camera, output=Output.median_depth, format=Format.webp)
     with pytest.raises(ValidationError, match="cannot be transparent"):
         RenderRequest(camera=camera, format=Format.jpeg, background="transparent")
     with pytest.raises(ValidationError, match="multiple of 2"):

@@ -117,6 +117,23 @@ def test_depth_as_floats_and_as_sixteen_bits(http: httpx.Client) -> None:
     assert ((whole == 0) == (floats == 0)).all()
 
 
+def test_the_first_surface_and_its_normal(http: httpx.Client) -> None:
+    body = RenderRequest(camera=FRONT, output=Output.median_depth, format=Format.npy)
+    floats = pixels(picture(http, body))
+    assert 2.9 < floats[24, 32] < 3.6
+    assert floats[0, 0] == 0
+    answer = picture(http, RenderRequest(camera=FRONT, output=Output.median_depth))
+    assert np.abs(pixels(answer) * float(answer.headers[DEPTH_SCALE_HEADER]) - floats).max() < 1e-3
+    normals = pixels(picture(http, RenderRequest(camera=FRONT, output=Output.normal, format=Format.npy)))
+    towards = np.array(FRONT.opencv_to_world())[:3, 2]
+    assert normals.shape == (48, 64, 3)
+    assert normals[24, 32] @ towards < -0.8
+    assert (normals[0, 0] == 0).all()
+    image = pixels(picture(http, RenderRequest(camera=FRONT, output=Output.normal)))
+    assert np.abs(image[24, 32] / 255.0 - (0.5 + 0.5 * normals[24, 32])).max() < 0.01
+    assert (image[0, 0] == 0).all()
+
+
 def test_the_same_picture_is_not_sent_twice(http: httpx.Client) -> None:
     body = RenderRequest(camera=FRONT)
     first = picture(http, body)

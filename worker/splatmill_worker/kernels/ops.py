@@ -26,6 +26,7 @@ __all__ = [
     "correlate",
     "knn",
     "loss",
+    "median_depth",
     "photo_stats",
     "project",
 ]
@@ -113,15 +114,37 @@ def composite(
     name = _backend(backend, projected.means2d)
     kind = _check_projected(projected, name)
     checks.image_size(width, height)
-    tiles = -(-width // TILE) * -(-height // TILE)
-    checks.tensor("bins.offsets", bins.offsets, (tiles + 1,), dtype=torch.int64, device=kind["device"])
-    checks.tensor("bins.ids", bins.ids, (None,), dtype=torch.int32, device=kind["device"])
+    _check_bins(bins, width, height, kind["device"])
     if background is not None:
         checks.tensor("background", background, (3,), **kind)
     image: tuple[Tensor, Tensor, Tensor] = _op(name, "composite")(
         projected, bins, width, height, background=background
     )
     return image
+
+
+def median_depth(
+    projected: Projected,
+    bins: Bins,
+    width: int,
+    height: int,
+    *,
+    tilts: Tensor | None = None,
+    backend: Backend | None = None,
+) -> Tensor:
+    """Return the median depth [H,W]: z of the first splat that leaves a transmittance of 1/2 or less, 0 without one.
+
+    tilts [N,2]: of the plane that each Gaussian counts as. At the offset d from its mean2d, in pixels, z = depth /
+    (1 - tilt . d); beyond 1000 times its depth there is none. None is 0. Not differentiable.
+    """
+    name = _backend(backend, projected.means2d)
+    kind = _check_projected(projected, name)
+    checks.image_size(width, height)
+    _check_bins(bins, width, height, kind["device"])
+    if tilts is None:
+        tilts = torch.zeros_like(projected.means2d)
+    checks.tensor("tilts", tilts, (len(projected.means2d), 2), **kind)
+    return cast(Tensor, _op(name, "median_depth")(projected, bins, width, height, tilts=tilts))
 
 
 def loss(
@@ -254,6 +277,12 @@ def _check_projected(projected: Projected, backend: Backend) -> dict[str, Any]:
     for name, shape in shapes.items():
         checks.tensor(f"projected.{name}", getattr(projected, name), shape, **kind)
     return kind
+
+
+def _check_bins(bins: Bins, width: int, height: int, device: str) -> None:
+    tiles = -(-width // TILE) * -(-height // TILE)
+    checks.tensor("bins.offsets", bins.offsets, (tiles + 1,), dtype=torch.int64, device=device)
+    checks.tensor("bins.ids", bins.ids, (None,), dtype=torch.int32, device=device)
 
 
 def _check_mask(mask: Tensor | None, height: int, width: int, device: str) -> None:

@@ -19,6 +19,12 @@ ALPHA_MAX = 0.999
 TRANSMITTANCE_MIN = 1e-4
 """A splat that would bring a pixel's transmittance to this or below is not blended, and ends the pixel."""
 
+MEDIAN = 0.5
+"""Transmittance at which a pixel has its median depth."""
+
+NEAREST_HORIZON = 1e-3
+"""Depth at a splat's centre over the largest depth to which its plane is followed."""
+
 BLUR = 0.3
 """Added to both variances of a projected Gaussian, pixels^2."""
 

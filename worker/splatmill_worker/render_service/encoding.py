@@ -37,7 +37,13 @@ def camera_of(spec: CameraSpec) -> Camera:
 
 def render_image(model: LoadedModel, request: RenderRequest) -> EncodedImage:
     """Render and encode the requested image."""
-    arrays = _render(model, camera_of(request.camera), request.background)
+    camera = camera_of(request.camera)
+    if request.output in (Output.median_depth, Output.normal):
+        depth, normal = _surface(model, camera)
+        if request.output is Output.median_depth:
+            return _encode_depth(depth, request)
+        return _encode_normal(normal, request)
+    arrays = _render(model, camera, request.background)
     match request.output:
         case Output.color:
             return _encode_color(arrays, request)
@@ -71,6 +77,14 @@ def _render(model: LoadedModel, camera: Camera, background: str) -> dict[str, np
     return {name: tensor.cpu().numpy() for name, tensor in arrays.items()}
 
 
+def _surface(model: LoadedModel, camera: Camera) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+    """Return median depth [H, W] and normals [H, W, 3] as float32 arrays."""
+    from splatmill_worker.splat.surface import surface
+
+    seen = surface(model.gaussians, camera, antialias=model.antialias, backend=cast(Any, model.backend))
+    return seen.depth.cpu().numpy(), seen.normal.cpu().numpy()
+
+
 def _encode_color(arrays: dict[str, Any], request: RenderRequest) -> EncodedImage:
     color = arrays["color"]
     if request.background == "transparent":
@@ -94,6 +108,13 @@ def _encode_depth(depth: npt.NDArray[np.float32], request: RenderRequest) -> Enc
     pixels = np.where(depth > 0, np.clip(np.rint(depth / scale), 1, _MAX_UINT16), 0).astype(np.uint16)
     encoded = _encode_pixels(pixels, request)
     return EncodedImage(encoded.data, encoded.media_type, {DEPTH_SCALE_HEADER: repr(scale)})
+
+
+def _encode_normal(normal: npt.NDArray[np.float32], request: RenderRequest) -> EncodedImage:
+    if request.format is Format.npy:
+        return _encode_array(normal)
+    there = np.any(normal != 0, axis=-1, keepdims=True)
+    return _encode_pixels(_to_uint8(np.where(there, 0.5 + 0.5 * normal, 0.0)), request)
 
 
 def _to_uint8(values: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:

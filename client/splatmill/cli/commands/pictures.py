@@ -58,8 +58,11 @@ def render(
         ),
     ] = None,
     output: Annotated[
-        Literal["color", "depth", "alpha"],
-        typer.Option(help="What to render: colour, depth along the viewing axis, or opacity."),
+        Literal["color", "depth", "median_depth", "normal", "alpha"],
+        typer.Option(
+            help="What to render: colour, mean depth along the viewing axis, depth of the first surface, its normal, "
+            "or opacity."
+        ),
     ] = "color",
     background: Annotated[
         Literal["black", "white", "transparent"], typer.Option(help="Colour behind the model.")

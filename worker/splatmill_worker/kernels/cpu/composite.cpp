@@ -24,6 +24,8 @@ void check_lists(const int64_t* offsets, int64_t tiles, const int32_t* ids, int6
                                   std::to_string(count) + " Gaussians.");
 }
 
+}  // namespace
+
 void take_lists(Frame& frame, const ProjectedRows& rows, int64_t count, const int64_t* offsets, const int32_t* ids,
                 int64_t pairs, int threads) {
   const int tiles = frame.tiles(), columns = frame.camera.columns();
@@ -52,6 +54,8 @@ void take_lists(Frame& frame, const ProjectedRows& rows, int64_t count, const in
       }
   }
 }
+
+namespace {
 
 // Numbers the slots of the pairs so that those of a Gaussian are consecutive, in tile order.
 void assign_slots(Frame& frame) {

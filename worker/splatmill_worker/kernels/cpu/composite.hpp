@@ -29,4 +29,11 @@ enum PairSum {
 // Writes the pair_sums of every pair that the forward pass blended, and clears `blocks` of every other touch.
 void composite_backward(Frame& frame, const ImageGradient& gradient, int threads);
 
+struct ProjectedRows;
+
+// Fills the records and entries of a frame, whose camera has its size, from `count` projected rows and the lists of a caller, of
+// `pairs` ids. Throws std::invalid_argument for lists that would make a pass read out of bounds.
+void take_lists(Frame& frame, const ProjectedRows& rows, int64_t count, const int64_t* offsets, const int32_t* ids,
+                int64_t pairs, int threads);
+
 }  // namespace splatmill

@@ -12,6 +12,7 @@ void bind_composite(nb::module_& m);
 void bind_correlate(nb::module_& m);
 void bind_knn(nb::module_& m);
 void bind_loss(nb::module_& m);
+void bind_median_depth(nb::module_& m);
 void bind_pack(nb::module_& m);
 void bind_project(nb::module_& m);
 void bind_step(nb::module_& m);
@@ -70,6 +71,7 @@ NB_MODULE(SPLATMILL_MODULE, m) {
   bind_correlate(m);
   bind_knn(m);
   bind_loss(m);
+  bind_median_depth(m);
   bind_pack(m);
   bind_project(m);
   bind_step(m);

@@ -22,7 +22,19 @@ from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource, make_backend
 from triton.runtime.jit import create_function_from_signature
 
-from . import adam, bin, composite, composite_backward, knn, loss, photos, project, project_backward, step
+from . import (
+    adam,
+    bin,
+    composite,
+    composite_backward,
+    knn,
+    loss,
+    median_depth,
+    photos,
+    project,
+    project_backward,
+    step,
+)
 from .argument import declared
 from .blended import SEGMENT
 
@@ -105,6 +117,8 @@ def variants() -> Iterator[Variant]:
     yield Variant(step.scores_kernel, {"BLOCK": step.SCORES_BLOCK}, settings=warps)
     yield Variant(adam.planes_kernel, {"BLOCK": adam.BLOCK}, settings=warps)
     yield Variant(adam.drift_kernel, {"BLOCK": adam.BLOCK}, settings=warps)
+    two = (triton.Config({}, num_warps=2),)
+    yield Variant(median_depth.median_depth_kernel, {}, settings=two)
     yield Variant(knn.knn_kernel, {"ROWS": knn.ROWS, "OTHERS": knn.OTHERS}, settings=warps)
 
 

@@ -6,6 +6,7 @@ from .composite import composite
 from .correlate import correlate
 from .knn import knn
 from .loss import PhotoStats, loss, photo_stats
+from .median_depth import median_depth
 from .project import project
 
 __all__ = [
@@ -17,6 +18,7 @@ __all__ = [
     "correlate",
     "knn",
     "loss",
+    "median_depth",
     "photo_stats",
     "project",
 ]
