@@ -5,7 +5,7 @@ import textwrap
 from docs.generate.markdown import choices, code, table
 
 from splatmill.data_sets import CAMERA_PROGRAMS, MAX_DEPTH, OTHER_CAMERAS, PLACES
-from splatmill.schema.files.formats import MODEL_FORMATS
+from splatmill.schema.files.formats import MODEL_FORMATS, POINT_FORMATS
 from splatmill.schema.files.masks import MASK_BEGINNINGS, MASK_ENDINGS, MASK_FOLDERS
 from splatmill.schema.files.names import MAX_PART_BYTES, MAX_PARTS
 from splatmill.schema.files.other_pictures import OTHER_FOLDERS, UNUSED
@@ -24,6 +24,7 @@ from splatmill_worker.images.colors import PRIMARIES, TRANSFERS, Colors
 from splatmill_worker.images.lens import PINHOLE_MODELS
 from splatmill_worker.images.no_photo import TRAITS
 from splatmill_worker.images.photo_colors import PhotoColors
+from splatmill_worker.readers import scan
 from splatmill_worker.readers.colmap_files import MODELS
 from splatmill_worker.scene import MIN_SHOWN
 from splatmill_worker.sfm.posed import colmap_model, model_files, points, polycam, triangulation
@@ -263,6 +264,12 @@ def _points() -> list[str]:
         less than {triangulation.CONTRADICTED:.0%} of the matches between photos: then the poses or the intrinsics are
         wrong, or belong to other photos. It names another convention of axes or matrices in which they fit, if one
         does.""",
+        """`--start scan.laz` names a file of points that takes the place of all these. It may be a `.ply` or one of the
+        formats below, of which all but text need `pip install 'splatmill-worker[scans]'`:""",
+        table(["suffix", "format"], [[code(suffix), name] for suffix, name in POINT_FORMATS.items()]),
+        f"""Its coordinates must be those of the cameras, which therefore have to come with the photos; offsets such as
+        those of UTM are kept in float64. Of more than {scan.MOST:,} points, evenly chosen ones are read. The photos
+        judge the points as above, and refuse the job where they do not fit, with the share that does.""",
     ]
 
 

@@ -15,7 +15,7 @@ from splatmill.backplane import keys
 from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import PHOTO_SUFFIXES, BinKind, CreateJob, Job, Role, StoredKind, TrainOptions
-from splatmill.schema.files.formats import is_model_file
+from splatmill.schema.files.formats import is_start_file
 from splatmill_server.access.caller import Caller
 from splatmill_server.base.problems import ProblemError
 from splatmill_server.captures.records import Captures
@@ -127,7 +127,7 @@ class Admission:
             )
         photos = all(entry.path.lower().endswith(PHOTO_SUFFIXES) for entry in images)
         poses = self.storage.entries(layout.capture_files(capture_id, Role.poses))
-        posed = any(not is_model_file(entry.path) for entry in poses)  # a model to start from is no pose
+        posed = any(not is_start_file(entry.path) for entry in poses)  # a model to start from is no pose
         if len(images) == 1 and photos and not posed:
             raise ProblemError(
                 "too_few_images",
@@ -145,7 +145,7 @@ class Admission:
         ):
             raise ProblemError(
                 "file_not_found",
-                f"The model to start from, {name[:80]!r}, is not among the poses of the capture.",
+                f"The file to start from, {name[:80]!r}, is not among the poses of the capture.",
                 advice="Upload it with PUT /v1/captures/{id}/poses/{name} first, or give the id of a "
                 "stored model.",
             )

@@ -61,8 +61,8 @@ def points() -> tuple[torch.Tensor, torch.Tensor]:
     return torch.from_numpy(world.points), torch.from_numpy(world.colors)
 
 
-def posed_capture(directory: Path) -> Path:
-    """A capture on disk: images/ and poses/transforms.json, in OpenGL axes as other tools write them."""
+def posed_capture(directory: Path, offset: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Path:
+    """A capture on disk: images/ and poses/transforms.json, in OpenGL axes as other tools write them, all moved."""
     (directory / "images").mkdir(parents=True)
     (directory / "poses").mkdir()
     frames = []
@@ -70,7 +70,7 @@ def posed_capture(directory: Path) -> Path:
         Image.fromarray(rgb).save(directory / "images" / f"{i:02d}.png")
         matrix = np.eye(4)
         matrix[:3, :3] = camera.viewmat[:3, :3].T @ np.diag([1.0, -1.0, -1.0])
-        matrix[:3, 3] = camera.center
+        matrix[:3, 3] = camera.center + np.array(offset)
         frames.append({"file_path": f"images/{i:02d}.png", "transform_matrix": matrix.tolist()})
     camera = pictures()[0][0]
     lens = {"w": WIDTH, "h": HEIGHT, "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}

@@ -12,7 +12,7 @@ from pydantic import Field, field_validator
 from pydantic.fields import FieldInfo
 
 from splatmill.schema.base import ByteSize, Duration, Request, Response, without_controls
-from splatmill.schema.files.formats import is_model_file, readable_suffixes
+from splatmill.schema.files.formats import is_start_file, start_suffixes
 from splatmill.schema.files.names import safe_name
 from splatmill.schema.frames import known_distance
 from splatmill.schema.ids import ID
@@ -197,9 +197,10 @@ class TrainOptions(Request):
         default=None,
         max_length=512,
         description=(
-            "Model to start from, in place of the points of the reconstruction: the id of a model on the "
-            "server, or a model file (.ply, .spz, ...), given by its path or by its name among the capture's "
-            "poses. Its coordinates must be those of the capture's cameras."
+            "Model or points to start from, in place of the points of the reconstruction: the id of a model on the "
+            "server, a model file (.ply, .spz, ...), or a file of points (.las, .laz, .e57, .pcd, .xyz, .pts, .ply), "
+            "given by its path or by its name among the capture's poses. Its coordinates must be those of the "
+            "capture's cameras; points need cameras that came with the photos."
         ),
         json_schema_extra=_PHOTOS,
     )
@@ -358,9 +359,9 @@ class TrainOptions(Request):
     def _model_or_file(cls, start: str | None) -> str | None:
         if start is None or ID.fullmatch(start):
             return start
-        if not is_model_file(start):
+        if not is_start_file(start):
             raise ValueError(
-                f"{start[:80]!r} is neither the id of a model nor the name of a {readable_suffixes()} file"
+                f"{start[:80]!r} is neither the id of a model nor the name of a {start_suffixes()} file"
             )
         return safe_name(start)
 
@@ -379,7 +380,7 @@ class TrainOptions(Request):
     @property
     def start_file(self) -> str | None:
         """The name of a file among the capture's poses, if `start` is one."""
-        return self.start if self.start is not None and is_model_file(self.start) else None
+        return self.start if self.start is not None and is_start_file(self.start) else None
 
     @property
     def start_model(self) -> str | None:

@@ -296,15 +296,15 @@ def printable(name: str) -> str:
 
 
 def start_model(path: Path) -> LocalFile:
-    """Return a model to start from as a file of the capture; its role is poses, whose coordinates it shares.
+    """Return the file to start from as one of the capture; its role is poses, whose coordinates it shares.
 
     Raises NothingToUpload where there is no such file, or where the service does not accept its name.
     """
     if not path.is_file():
         lacking = "is not a file" if path.exists() else "does not exist"
         raise NothingToUpload(
-            f"The model {path} to start from {lacking}.",
-            "Give the path of a model file, or the id of a model.",
+            f"The file {path} to start from {lacking}.",
+            "Give the path of a file of a model or of points, or the id of a model.",
         )
     try:
         return _local(Role.poses, safe_name(path.name), path)

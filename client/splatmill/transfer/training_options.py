@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from splatmill.errors import invalid_request
 from splatmill.schema import TrainOptions
-from splatmill.schema.files.formats import is_model_file
+from splatmill.schema.files.formats import is_start_file
 from splatmill.transfer.local_capture import start_model
 
 
@@ -22,7 +22,7 @@ def with_start_model(
     neither holds the file.
     """
     start = options.get("start")
-    if start is None or not is_model_file(str(start)):
+    if start is None or not is_start_file(str(start)):
         return dict(options), None
     path = Path(start).expanduser()
     inside = Path(folder).expanduser() / path

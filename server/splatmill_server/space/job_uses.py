@@ -10,7 +10,7 @@ import redis
 
 from splatmill.backplane import keys
 from splatmill.schema import DEFAULT_OWNER, StoredKind
-from splatmill.schema.files.formats import is_model_file
+from splatmill.schema.files.formats import is_start_file
 from splatmill_server.jobs.reading import read_jobs
 from splatmill_server.space.holdings import Holding
 
@@ -97,7 +97,7 @@ def _use(job_id: str, fields: Mapping[str, bytes | None], states: Any, unfinishe
         owner=texts.get("owner", DEFAULT_OWNER),
         name=texts.get("name"),
         capture=capture,
-        start_model=start if isinstance(start, str) and not is_model_file(start) else None,
+        start_model=start if isinstance(start, str) and not is_start_file(start) else None,
         last_heard=max(moments),
         unfinished=unfinished,
         readable=capture is not None and options is not None,

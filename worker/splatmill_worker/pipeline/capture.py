@@ -13,7 +13,7 @@ from splatmill_worker.errors import Refusal
 from splatmill_worker.images import overlays
 from splatmill_worker.images.masks import mask_folder
 from splatmill_worker.images.prepare import names_remark
-from splatmill_worker.pipeline import one_place
+from splatmill_worker.pipeline import given_points, one_place
 from splatmill_worker.scene import Scene
 from splatmill_worker.sfm import posed
 from splatmill_worker.sfm.placed import PlacingObserver
@@ -43,7 +43,7 @@ def posed_scene(
     cancelled: polled; when it returns true, Cancelled is raised.
     observer: looks at the cameras and points while structure from motion places them.
 
-    Raises Refusal for poses that cannot be used and for a scale that cannot be followed, and SfmFailed.
+    Raises Refusal for poses and points that cannot be used and for a scale that cannot be followed, and SfmFailed.
     """
     capture = zipped.data_set(capture, workdir, cancelled)
     try:
@@ -52,6 +52,7 @@ def posed_scene(
         raise Refusal(
             "poses_invalid", str(error), advice="Give one data set, or photos without cameras."
         ) from error
+    points = given_points.points_path(capture, options)
     if given is not None:
         if options.scale is not None:
             raise Refusal(
@@ -76,10 +77,21 @@ def posed_scene(
                 ),
                 advice="Correct the poses, or remove them to have the cameras recovered from the photos.",
             ) from error
+        if points is not None:
+            scene = given_points.with_given_points(scene, points)
         scene = posed.with_points(
             scene, workdir, seed=options.seed, on_progress=on_progress, cancelled=cancelled
         )
+        if points is not None:
+            given_points.require_shown(scene, points)
         return replace(scene, warnings=(*scene.warnings, *one_place.warning(scene)))
+    if points is not None:
+        raise Refusal(
+            "start_unusable",
+            f"{points.name} holds points, and no cameras came with the photos: cameras that are recovered from photos "
+            "have a coordinate system of their own, in which the points do not lie.",
+            advice="Give the cameras in the coordinates of the points too, or leave out the option start.",
+        )
     images = capture / "images"
     wanted = sfm.SfmOptions(
         effort=options.sfm_effort.value,

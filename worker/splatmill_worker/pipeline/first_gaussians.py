@@ -9,8 +9,8 @@ import torch
 
 from splatmill.schema import TrainOptions
 from splatmill_worker import memory
-from splatmill_worker.errors import Refusal
 from splatmill_worker.pipeline.cameras import Cameras
+from splatmill_worker.pipeline.given_points import points_path, start_path
 from splatmill_worker.pipeline.job import Job
 from splatmill_worker.pipeline.photos import Photos
 from splatmill_worker.splat.gaussians import Gaussians
@@ -113,11 +113,4 @@ def start_model_path(capture: Path, workdir: Path, options: TrainOptions) -> Pat
         return None
     if options.start_file is None:
         return workdir / "start.ply"
-    for folder in (capture / "poses", capture):
-        if (folder / options.start_file).is_file():
-            return folder / options.start_file
-    raise Refusal(
-        "start_unusable",
-        f"There is no file {options.start_file!r} among the poses of the capture.",
-        advice="Upload the model file to the poses of the capture, or leave out the option start.",
-    )
+    return None if points_path(capture, options) is not None else start_path(capture, options)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -40,13 +42,24 @@ def read(path: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8]]:
 
 
 def _colors(vertex: PlyElement) -> npt.NDArray[np.uint8]:
-    """Colours [N,3] of 8 bits: channels reach up to 1, 255 or 65535, whichever the largest value needs."""
-    colors = np.full((vertex.count, 3), GREY, np.uint8)
     names = {each.name for each in vertex.properties}
     channels = next((each for each in CHANNELS if names.issuperset(each)), None)
-    if channels is None or not vertex.count:
+    if channels is None:
+        return grey(vertex.count)
+    return eight_bits([vertex[channel] for channel in channels])
+
+
+def grey(count: int) -> npt.NDArray[np.uint8]:
+    """Colours [count,3] of points that have none."""
+    return np.full((count, 3), GREY, np.uint8)
+
+
+def eight_bits(channels: Sequence[npt.NDArray[Any]]) -> npt.NDArray[np.uint8]:
+    """Colours [N,3] of 8 bits: channels reach up to 1, 255 or 65535, whichever the largest value needs."""
+    values = [np.nan_to_num(channel, posinf=0, neginf=0) for channel in channels]
+    colors = grey(len(values[0]))
+    if not len(colors):
         return colors
-    values = [np.nan_to_num(vertex[channel], posinf=0, neginf=0) for channel in channels]
     largest = max(float(value.max()) for value in values)
     floats = any(value.dtype.kind == "f" for value in values)
     full = 1.0 if floats and largest <= 1 else 255.0 if largest <= 255 else 65535.0

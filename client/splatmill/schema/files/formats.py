@@ -117,9 +117,30 @@ def is_model_file(name: str) -> bool:
     return model_format is not None and model_format.readable and model_format.suffix.startswith(".")
 
 
-def readable_suffixes() -> str:
-    """The suffixes of the files from which a model can be read, for a sentence."""
-    suffixes = [suffix for suffix in MODEL_FORMATS if is_model_file(suffix)]
+POINT_FORMATS: dict[str, str] = {
+    ".las": "LAS of laser scanners",
+    ".laz": "LAS, compressed",
+    ".e57": "E57 of laser scanners",
+    ".pcd": "PCD of the Point Cloud Library",
+    ".xyz": "text with a point a line: x, y, z, and red, green, blue where it has them",
+    ".pts": "the same, with an intensity before the colours and the number of points in the first line",
+}
+"""Formats of points alone by their suffix, besides .ply, which holds points or a model."""
+
+
+def is_point_file(name: str) -> bool:
+    """Whether a name is that of a file of points alone; one of a .ply does not say so."""
+    return name.lower().endswith(tuple(POINT_FORMATS))
+
+
+def is_start_file(name: str) -> bool:
+    """Whether a name is that of a file that a training may start from: of a model, or of points."""
+    return is_model_file(name) or is_point_file(name)
+
+
+def start_suffixes() -> str:
+    """The suffixes of the files that a training may start from, for a sentence."""
+    suffixes = [suffix for suffix in (*MODEL_FORMATS, *POINT_FORMATS) if is_start_file(suffix)]
     return f"{', '.join(suffixes[:-1])} or {suffixes[-1]}"
 
 

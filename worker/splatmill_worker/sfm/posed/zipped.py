@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from splatmill.data_sets import MAX_DEPTH, TwoDataSets
-from splatmill.schema.files.formats import is_model_file
+from splatmill.schema.files.formats import is_start_file
 from splatmill.schema.files.photos import ARCHIVE_SUFFIXES
 from splatmill_worker.images import prepare
 from splatmill_worker.images.archives.archive import REMARK, Allowance
@@ -28,7 +28,7 @@ def data_set(capture: Path, workdir: Path, cancelled: Callable[[], bool] = lambd
     others = [path for folder in ("masks", "poses") for path in prepare.given_files(capture / folder)]
     if len(images) != 1 or images[0].suffix.lower() not in ARCHIVE_SUFFIXES or images[0].is_symlink():
         return capture
-    if any(not is_model_file(path.name) for path in others):
+    if any(not is_start_file(path.name) for path in others):
         return capture
     try:
         folder = prepare.unpacked(images[0].name, images[0], workdir, Allowance(), cancelled)

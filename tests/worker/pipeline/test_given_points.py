@@ -1,0 +1,113 @@
+"""Proves that a training starts from the points of a scan where they fit the cameras, and is refused where they do not.
+
+The scan is simulated on the still life: true surfaces with the noise of a scanner's ranges. Does not prove that a
+training gains from it.
+"""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatmill.schema import TrainOptions
+from splatmill_worker.errors import Refusal
+from splatmill_worker.pipeline import given_points
+from splatmill_worker.pipeline.capture import posed_scene
+from splatmill_worker.pipeline.first_gaussians import start_model_path
+from splatmill_worker.readers import scan
+from splatmill_worker.scene import Scene
+from splatmill_worker.splat.formats import ply
+from tests.support import gaussians, still_life
+from tests.worker.readers.test_scan import write_las, write_ply
+
+OFFSET = (500_000.0, 5_400_000.0, 300.0)
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Path:
+    """The photos of the still life with cameras in UTM-like coordinates."""
+    return still_life.posed_capture(tmp_path / "capture", OFFSET)
+
+
+def scanned(noise: float = 0.002) -> tuple[np.ndarray, np.ndarray]:
+    scene = still_life.scene()
+    random = np.random.default_rng(1)
+    return scene.points + np.array(OFFSET) + random.normal(0, noise, scene.points.shape), scene.colors
+
+
+def load(capture: Path, tmp_path: Path, start: str) -> Scene:
+    return posed_scene(capture, tmp_path / "work", TrainOptions(start=start), lambda *_: None, lambda: False)
+
+
+@pytest.mark.parametrize("name", ["scan.laz", "scan.ply"])
+def test_points_of_a_scan_take_the_place_of_the_others(name: str, capture: Path, tmp_path: Path) -> None:
+    points, colors = scanned()
+    (write_las if name.endswith("z") else write_ply)(capture / "poses" / name, points, colors)
+    scene = load(capture, tmp_path, name)
+    assert scene.facts["loose_points"] == len(points)
+    used = scene.facts["loose_points_used"]
+    assert used > 0.8 * len(points)
+    near = np.abs(scene.points[:used, None] - points[None]).max(axis=2).min(axis=1)
+    assert near.max() < 1e-3
+    assert f"{name} holds {len(points):,} points." in scene.notes
+    assert start_model_path(capture, tmp_path, TrainOptions(start=name)) is None
+
+
+@pytest.mark.parametrize("change", ["axes", "units"])
+def test_points_elsewhere_are_refused_with_the_share(change: str, capture: Path, tmp_path: Path) -> None:
+    points, colors = scanned()
+    points = np.array(OFFSET) + (
+        (points - np.array(OFFSET))[:, [1, 2, 0]] if change == "axes" else 1000 * (points - np.array(OFFSET))
+    )
+    write_ply(capture / "poses" / "scan.ply", points, colors)
+    with pytest.raises(Refusal) as refused:
+        load(capture, tmp_path, "scan.ply")
+    assert refused.value.code == "start_unusable"
+    assert "do not fit the cameras" in refused.value.message
+    assert "%" in refused.value.message
+
+
+def test_points_need_cameras(capture: Path, tmp_path: Path) -> None:
+    write_ply(capture / "poses" / "scan.ply", *scanned())
+    (capture / "poses" / "transforms.json").unlink()
+    with pytest.raises(Refusal, match=r"scan\.ply holds points, and no cameras came with the photos"):
+        load(capture, tmp_path, "scan.ply")
+
+
+def test_a_ply_with_gaussians_is_a_model(capture: Path, tmp_path: Path) -> None:
+    ply.write(capture / "poses" / "model.ply", gaussians.some_gaussians(20, 1))
+    options = TrainOptions(start="model.ply")
+    assert given_points.points_path(capture, options) is None
+    assert start_model_path(capture, tmp_path, options) == capture / "poses" / "model.ply"
+
+
+def test_a_library_that_is_missing_is_named(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_las(capture / "poses" / "scan.laz", *scanned())
+    monkeypatch.setitem(scan.LIBRARIES, ".laz", ("laspy", "no_such_module"))
+    with pytest.raises(Refusal, match="the Python module no_such_module is not installed"):
+        load(capture, tmp_path, "scan.laz")
+
+
+@pytest.mark.parametrize("data", [b"", b"LASF", b"1 2\n3 4\n"])
+def test_a_file_without_points_is_refused(data: bytes, capture: Path, tmp_path: Path) -> None:
+    for name in ("scan.las", "scan.xyz", "scan.e57", "scan.pcd"):
+        (capture / "poses" / name).write_bytes(data)
+        with pytest.raises(Refusal) as refused:
+            load(capture, tmp_path, name)
+        assert refused.value.code == "start_unusable"
+        assert name in refused.value.message
+
+
+def test_no_library_of_scans_is_imported_without_one() -> None:
+    code = (
+        "import sys, splatmill_worker.pipeline.stages; "
+        "print([name for name in ('laspy', 'lazrs', 'pye57', 'pypcd4') if name in sys.modules])"
+    )
+    assert (
+        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+        == "[]\n"
+    )
