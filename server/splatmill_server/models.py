@@ -336,6 +336,7 @@ def _links(model_id: str) -> dict[str, str]:
         "render": f"{base}/render",
         "orbit": f"{base}/orbit",
         "orbits": f"{base}/orbits",
+        "presentation": f"{base}/presentation",
         "formats": f"{base}/formats",
         "html": f"{base}/download/html",
         "ply": f"{base}/files/model.ply",

@@ -41,6 +41,7 @@ from splatmill_server.captures.records import Captures
 from splatmill_server.jobs.finished import Finished
 from splatmill_server.jobs.records import Jobs
 from splatmill_server.models import Models
+from splatmill_server.presentations import Presentations
 from splatmill_server.shares import Shares
 from splatmill_server.space.bin import Bin
 from splatmill_server.space.deletion import Deletion
@@ -114,6 +115,7 @@ class Service:
     shares: Shares
     conversions: Conversions
     orbits: Orbits
+    presentations: Presentations
     keys: Keys
     authentication: Authentication
     sessions: Sessions
@@ -175,6 +177,9 @@ class Service:
             shares=Shares(storage, connection, models),
             conversions=Conversions(storage, connection, models, renderer, quota, settings.orbit_timeout),
             orbits=Orbits(storage, connection, models, renderer, quota, settings.orbit_timeout),
+            presentations=Presentations(
+                storage, connection, models, renderer, quota, settings.render_timeout
+            ),
             keys=stored_keys,
             authentication=Authentication(settings, stored_keys, sessions),
             sessions=sessions,

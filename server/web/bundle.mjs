@@ -8,7 +8,7 @@ import { build } from "esbuild";
 /** What viewer/splats.js takes from PlayCanvas; a test compares them. */
 export const USED = [
   "AppBase", "AppOptions", "Asset", "CameraComponentSystem", "Color", "createGraphicsDevice", "DEVICETYPE_WEBGL2", "Entity",
-  "GSPLATDATA_LARGE", "GSplatComponentSystem", "GSplatHandler", "Mat4", "Quat", "SHADERLANGUAGE_GLSL", "ShaderChunks",
+  "GSPLATDATA_LARGE", "GSplatComponentSystem", "GSplatHandler", "Mat4", "Picker", "Quat", "SHADERLANGUAGE_GLSL", "ShaderChunks",
   "TextureHandler", "TONEMAP_NONE", "version",
 ];
 

@@ -14,7 +14,7 @@ import torch
 from PIL import Image
 from playwright.sync_api import Browser
 
-from splatmill.schema import CameraSpec, ModelCamera, ModelCameras
+from splatmill.schema import Annotation, CameraSpec, ModelCamera, ModelCameras, Presentation
 from splatmill_server.responses.single_file import single_file
 from splatmill_worker.render_service.encoding import camera_of
 from splatmill_worker.splat.formats import ply, sog
@@ -38,7 +38,12 @@ def test_the_file_draws_the_model_and_asks_for_nothing(browser: Browser, tmp_pat
     )
     name = 'A ball </title><script>throw "no"</script>'
     sog.write(tmp_path / "model.sog", scene)
-    made = single_file(name, (tmp_path / "model.sog").read_bytes(), cameras, antialias=False)
+    shown_as = Presentation(
+        start_view=CameraSpec.looking_at((1, -4, 0.5), (0, 0, 0), width=480, height=360),
+        annotations=[Annotation(point=(0, -1, 0), text="</script>the top")],
+    )
+    packed = (tmp_path / "model.sog").read_bytes()
+    made = single_file(name, packed, cameras, antialias=False, presentation=shown_as)
     (tmp_path / "model.html").write_bytes(made)
     context = browser.new_context(viewport={"width": 480, "height": 360}, offline=True)
     try:
@@ -59,6 +64,12 @@ def test_the_file_draws_the_model_and_asks_for_nothing(browser: Browser, tmp_pat
             "() => { const same = view.frames === before; globalThis.before = view.frames; return same; }",
             polling=300,
         )
+        assert page.evaluate("view.pose.position") == [1, -4, 0.5], "it begins with the start view"
+        page.get_by_role("button", name="Annotation 1").click()
+        assert page.locator(".pin-text").text_content() == "</script>the top"
+        point = page.evaluate("view.pointAt(240, 180)")  # of what is drawn, since there is no server
+        assert abs(np.linalg.norm(point) - 1) < 0.15, "it lies on the unit ball"
+        page.evaluate("document.querySelectorAll('.view-bar, .said, .pins').forEach((each) => each.remove())")
         spec = CameraSpec.model_validate(page.evaluate("view.getCamera()"))
         with Image.open(io.BytesIO(page.locator("#view").screenshot())) as picture:
             shown = np.asarray(picture.convert("RGB")) / 255.0

@@ -6,9 +6,10 @@ import typing
 from enum import StrEnum
 from typing import Any, Literal
 
+from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from splatmill.schema import OrbitRequest, RenderRequest, TrainOptions
+from splatmill.schema import ChangePresentation, OrbitRequest, RenderRequest, TrainOptions
 from splatmill.schema.base import Request
 from tests.support.paths import ROOT
 
@@ -22,6 +23,11 @@ CLASSES: tuple[tuple[str, type[Request], str], ...] = (
         "How an image is rendered: the fields of `RenderRequest` but the camera.",
     ),
     ("OrbitArguments", OrbitRequest, "How a video is rendered: the fields of `OrbitRequest`."),
+    (
+        "PresentationArguments",
+        ChangePresentation,
+        "How a model is shown to people: the fields of `Presentation`.",
+    ),
 )
 
 WIDER = {"duration": "float | str", "bytes": "int | str"}
@@ -33,19 +39,19 @@ PATHS = {"start": "str | os.PathLike[str]"}
 
 def text() -> str:
     """The whole module."""
-    enums = sorted({name for _, model, _ in CLASSES for name in _enums(model)})
+    names = sorted({name for _, model, _ in CLASSES for name in _names(model)})
     head = [
-        '"""The keyword arguments of `train`, `render` and `orbit`, for editors and type checkers.',
+        '"""The keyword arguments of `train`, `render`, `orbit` and `present`, for editors and type checkers.',
         "",
         "Generated from the schema by `python -m tests.support.arguments`.",
         '"""',
         "",
         "import os",
-        "from collections.abc import Sequence",
-        "from typing import Literal, TypedDict",
+        "from collections.abc import Mapping, Sequence",
+        "from typing import Any, Literal, TypedDict",
         "",
         "from splatmill.schema import (",
-        *(f"    {name}," for name in enums),
+        *(f"    {name}," for name in names),
         ")",
     ]
     return "\n".join([*head, *(line for entry in CLASSES for line in _class(*entry))]) + "\n"
@@ -64,9 +70,14 @@ def _members(annotation: Any) -> list[Any]:
     return [annotation]
 
 
-def _enums(model: type[Request]) -> list[str]:
-    kinds = [kind for info in model.model_fields.values() for kind in _members(info.annotation)]
-    return [kind.__name__ for kind in kinds if isinstance(kind, type) and issubclass(kind, StrEnum)]
+def _names(model: type[Request]) -> list[str]:
+    """The names that the types of a message's fields import from the schema."""
+    fields = {name: info for name, info in model.model_fields.items() if name != "camera"}
+    members = [kind for info in fields.values() for kind in _members(info.annotation)]
+    kinds = [typing.get_args(kind)[0] if typing.get_origin(kind) is list else kind for kind in members]
+    return [
+        kind.__name__ for kind in kinds if isinstance(kind, type) and issubclass(kind, StrEnum | BaseModel)
+    ]
 
 
 def _type(name: str, info: FieldInfo) -> str:
@@ -83,6 +94,10 @@ def _one(kind: Any) -> str:
         return f"Literal[{', '.join(map(json.dumps, typing.get_args(kind)))}]"
     if typing.get_origin(kind) is tuple:
         return "Sequence[str]"
+    if typing.get_origin(kind) is list:
+        return f"Sequence[{_one(typing.get_args(kind)[0])}]"
+    if issubclass(kind, BaseModel):
+        return f"{kind.__name__} | Mapping[str, Any]"
     if issubclass(kind, StrEnum):
         return f"{kind.__name__} | Literal[{', '.join(json.dumps(str(member)) for member in kind)}]"
     return str(kind.__name__)

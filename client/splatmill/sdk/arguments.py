@@ -1,21 +1,25 @@
-"""The keyword arguments of `train`, `render` and `orbit`, for editors and type checkers.
+"""The keyword arguments of `train`, `render`, `orbit` and `present`, for editors and type checkers.
 
 Generated from the schema by `python -m tests.support.arguments`.
 """
 
 import os
-from collections.abc import Sequence
-from typing import Literal, TypedDict
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, TypedDict
 
 from splatmill.schema import (
+    Annotation,
     Backend,
     Background,
+    CameraSpec,
     Effort,
     Format,
     Mapper,
     Matcher,
+    Measurement,
     Output,
     Preset,
+    Scale,
     Switch,
 )
 
@@ -71,3 +75,14 @@ class OrbitArguments(TypedDict, total=False):
     height: int
     fov_y_deg: float | None
     background: Literal["black", "white"]
+
+
+class PresentationArguments(TypedDict, total=False):
+    """How a model is shown to people: the fields of `Presentation`."""
+
+    start_view: CameraSpec | Mapping[str, Any] | None
+    background: Literal["black", "white"]
+    auto_rotate: bool
+    scale: Scale | Mapping[str, Any] | None
+    measurements: Sequence[Measurement | Mapping[str, Any]]
+    annotations: Sequence[Annotation | Mapping[str, Any]]

@@ -27,6 +27,7 @@ from splatmill.schema import (
     ModelDownload,
     OptionHelp,
     Placement,
+    Presentation,
     Problem,
     Ready,
     Report,
@@ -34,7 +35,7 @@ from splatmill.schema import (
     TrainOptions,
 )
 from splatmill.sdk.aio import AsyncClient
-from splatmill.sdk.arguments import OrbitArguments, RenderArguments, TrainArguments
+from splatmill.sdk.arguments import OrbitArguments, PresentationArguments, RenderArguments, TrainArguments
 from splatmill.sdk.client_records import Bin, Imports, Keys, Orbits, Shares, Webhooks
 from splatmill.sdk.job import MOST_LINES, AsyncJobHandle
 from splatmill.sdk.loop import BackgroundLoop
@@ -95,6 +96,20 @@ class ModelHandle:
     def cameras(self) -> list[ModelCamera]:
         """Return the cameras of the capture in the coordinates of the model; `split` marks the held-out ones."""
         return self._loop.run(self._async.cameras())
+
+    def presentation(self) -> Presentation:
+        """Return how the model is shown to people: its start view, scale, measurements and annotations."""
+        return self._loop.run(self._async.presentation())
+
+    def present(self, **changes: Unpack[PresentationArguments]) -> Presentation:
+        """Change how the model and its links are shown to people, and return the whole of it.
+
+        `changes` are fields of `Presentation`; those that are left out stay as they are, and None takes the start view
+        or the scale away. Another start view makes the server render the picture `poster.jpg`.
+
+        Raises InvalidRequest for values that are not valid.
+        """
+        return self._loop.run(self._async.present(**changes))
 
     def render(self, camera: CameraSpec | Mapping[str, Any], **options: Unpack[RenderArguments]) -> bytes:
         """Render an image from `camera`, and return the bytes of the file.

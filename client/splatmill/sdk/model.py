@@ -14,6 +14,7 @@ from splatmill.files import atomic_write
 from splatmill.schema import (
     Box,
     CameraSpec,
+    ChangePresentation,
     Edited,
     EditModel,
     Model,
@@ -22,9 +23,10 @@ from splatmill.schema import (
     ModelDownload,
     ModelDownloads,
     OrbitRequest,
+    Presentation,
     RenderRequest,
 )
-from splatmill.sdk.arguments import OrbitArguments, RenderArguments
+from splatmill.sdk.arguments import OrbitArguments, PresentationArguments, RenderArguments
 from splatmill.sdk.orbits import AsyncOrbits, orbit_request
 from splatmill.sdk.shares import AsyncShares
 from splatmill.transfer.connection import Connection, read_answer
@@ -106,6 +108,33 @@ class AsyncModelHandle:
         """Return the cameras of the capture in the coordinates of the model; `split` marks the held-out ones."""
         response = await self.connection.request("GET", f"/v1/models/{self.id}/cameras")
         return read_answer(ModelCameras, response).cameras
+
+    async def presentation(self) -> Presentation:
+        """Return how the model is shown to people: its start view, scale, measurements and annotations."""
+        response = await self.connection.request("GET", f"/v1/models/{self.id}/presentation")
+        return read_answer(Presentation, response)
+
+    async def present(self, **changes: Unpack[PresentationArguments]) -> Presentation:
+        """Change how the model and its links are shown to people, and return the whole of it.
+
+        `changes` are fields of `Presentation`; those that are left out stay as they are, and None takes the start view
+        or the scale away. Another start view makes the server render the picture `poster.jpg`.
+
+        Raises InvalidRequest for values that are not valid.
+        """
+        try:
+            request = ChangePresentation.model_validate(changes)
+        except ValidationError as error:
+            raise invalid_request(error) from error
+        response = await self.connection.request(
+            "PATCH",
+            f"/v1/models/{self.id}/presentation",
+            json=request.model_dump(mode="json", exclude_unset=True),
+            repeatable=True,
+            costly=True,
+            timeout=RENDER_TIMEOUT,
+        )
+        return read_answer(Presentation, response)
 
     async def render(
         self, camera: CameraSpec | Mapping[str, Any], **options: Unpack[RenderArguments]

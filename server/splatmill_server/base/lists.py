@@ -207,6 +207,10 @@ class Lists:
         if records:
             self.connection.hset(keys.records(kind), mapping=cast(Any, records))
 
+    def forget(self, kind: lists.Kind, record_id: str) -> None:
+        """Forget what lists show of a record that has changed; it is read when it is next asked for."""
+        self.connection.hdel(keys.records(kind), record_id)
+
 
 def each(read: Callable[[str], T], record_ids: Sequence[str]) -> list[T]:
     """Return what `read` returns for each record, several at a time, because storage may be far away."""

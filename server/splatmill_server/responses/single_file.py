@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from html import escape
 from pathlib import Path, PurePosixPath
 
-from splatmill.schema import ModelCameras
+from splatmill.schema import ModelCameras, Presentation
 from splatmill_server.base.problems import ProblemError
 
 WEB = Path(__file__).parents[1] / "web"
@@ -33,13 +33,16 @@ html, body { margin: 0; height: 100%; background: #000; color: #ddd; font: 16px/
 
 _START = """
 import { open } from "splatmill/viewer.js";
+import { present } from "splatmill/viewer/presented.js";
 const text = (id) => document.getElementById(id).textContent;
 const said = document.getElementById("said");
 said.textContent = "The model is being unpacked.";
 try {
   const bytes = Uint8Array.from(atob(text("model")), (letter) => letter.charCodeAt(0));
-  const { cameras, ...options } = JSON.parse(text("options"));
-  globalThis.view = await open(document.getElementById("view"), { bytes, cameras, ...options });
+  const { presentation, ...options } = JSON.parse(text("options"));
+  const box = document.getElementById("view");
+  globalThis.view = await open(box, { bytes, ...options });
+  present(box, view, presentation, options.label);
   said.textContent = "";
 } catch (error) {
   said.textContent = `The model cannot be shown: ${error.message}`;
@@ -47,23 +50,42 @@ try {
 """
 
 
-def single_file(name: str, packed: bytes, cameras: ModelCameras, antialias: bool) -> bytes:
+def single_file(
+    name: str,
+    packed: bytes,
+    cameras: ModelCameras,
+    antialias: bool,
+    presentation: Presentation | None = None,
+    poster: bytes | None = None,
+) -> bytes:
     """Return the HTML file of a model.
 
     name: the title.
     packed: the model as a `.sog`, the smallest format that the viewer draws.
     cameras: those of its photos, whose names are left out.
     antialias: whether the model was trained with antialiasing.
+    presentation: how its owner wants it to be shown; None: as ever.
+    poster: the picture from its start view, a JPEG.
 
     Raises a problem where the server was installed without PlayCanvas.
     """
     specs = [camera.camera.model_dump(mode="json", exclude_none=True) for camera in cameras.cameras]
-    options = {"cameras": specs[:: len(specs) // MOST_CAMERAS + 1], "antialias": antialias, "label": name}
+    shown = presentation or Presentation()
+    view = shown.start_view
+    options = {
+        "cameras": specs[:: len(specs) // MOST_CAMERAS + 1],
+        "antialias": antialias,
+        "label": name,
+        "background": shown.background,
+        "presentation": shown.model_dump(mode="json", exclude={"start_view"}),
+        **({"camera": view.model_dump(mode="json", exclude_none=True)} if view else {}),
+        **({"poster": _data(poster, "image/jpeg")} if view and poster else {}),
+    }
     # Within a script element, "<" could end it.
     options_text = json.dumps(options).replace("<", "\\u003c")
     license_text = _vendor("playcanvas/LICENSE").replace("--", "- -")
-    imports = {module: _data(source) for module, source in _modules()}
-    imports["playcanvas"] = _data(_vendor("playcanvas/playcanvas.mjs"))
+    imports = {module: _data(source.encode()) for module, source in _modules()}
+    imports["playcanvas"] = _data(_vendor("playcanvas/playcanvas.mjs").encode())
     return "\n".join(
         (
             "<!doctype html>",
@@ -86,7 +108,7 @@ def single_file(name: str, packed: bytes, cameras: ModelCameras, antialias: bool
 def _modules() -> Iterator[tuple[str, str]]:
     """The viewer's modules, each with its name and source. They import each other by these names, because relative
     addresses mean nothing between modules that have no address."""
-    pending, visited = [PurePosixPath("viewer.js")], set()
+    pending, visited = [PurePosixPath("viewer.js"), PurePosixPath("viewer/presented.js")], set()
     while pending:
         path = pending.pop()
         if path in visited:
@@ -122,5 +144,5 @@ def _vendor(name: str) -> str:
         ) from error
 
 
-def _data(source: str) -> str:
-    return f"data:text/javascript;base64,{base64.b64encode(source.encode()).decode()}"
+def _data(content: bytes, media_type: str = "text/javascript") -> str:
+    return f"data:{media_type};base64,{base64.b64encode(content).decode()}"

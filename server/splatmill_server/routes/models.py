@@ -10,6 +10,7 @@ from splatmill.backplane import rendering
 from splatmill.backplane.storage import layout
 from splatmill.schema import (
     DOWNLOADS,
+    POSTER,
     Model,
     ModelCameras,
     ModelDownloads,
@@ -157,7 +158,11 @@ async def download_html(service: Shared, who: Who, model_id: ModelId, request: R
         model = service.models.get(model_id)
         cameras = service.models.get_cameras(model_id)
         antialias = service.models.antialias(model_id)
-        return single_file(model.name or model_id, service.storage.get(path), cameras, antialias)
+        presentation, poster = service.presentations.get(model_id), None
+        if any(file.name == POSTER for file in model.files):
+            poster = service.storage.get(layout.model_file(model_id, POSTER))
+        packed, name = service.storage.get(path), model.name or model_id
+        return single_file(name, packed, cameras, antialias, presentation, poster)
 
     headers = {
         "Content-Disposition": attachment(await run_in_threadpool(file_name, service, model_id, ".html")),

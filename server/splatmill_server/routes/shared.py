@@ -8,7 +8,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
 from splatmill.backplane.storage import layout
-from splatmill.schema import DOWNLOADS, KeyLimits, ModelCameras, ModelDownloads, SharedModel
+from splatmill.schema import DOWNLOADS, KeyLimits, ModelCameras, ModelDownloads, Presentation, SharedModel
 from splatmill_server.access.caller import Caller
 from splatmill_server.base.problems import ProblemError
 from splatmill_server.base.root_path import address
@@ -128,6 +128,12 @@ async def download_shared(
 def get_shared_cameras(service: Shared, share: OpenShare) -> ModelCameras:
     """Get the cameras of the photos in the coordinates of the model that a link shows."""
     return service.shares.get_cameras(share)
+
+
+@router.get("/presentation", responses=problems("share_not_found", "share_ended", "model_not_found"))
+def get_shared_presentation(service: Shared, share: OpenShare) -> Presentation:
+    """Get how the model that a link shows is to be shown: start view, scale, measurements and annotations."""
+    return service.presentations.get(share.model)
 
 
 @router.get(

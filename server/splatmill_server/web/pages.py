@@ -8,7 +8,7 @@ from pathlib import Path
 from fastapi import APIRouter, Request
 from starlette.responses import FileResponse, Response
 
-from splatmill.schema import SharedModel
+from splatmill.schema import POSTER, SharedModel
 from splatmill_server.base.problems import ProblemError
 from splatmill_server.base.root_path import own_path
 from splatmill_server.service import Service, Shared
@@ -29,8 +29,8 @@ IMPORT_MAP_HERE = "<!-- import map -->"
 POSTER_HERE = "<!-- poster -->"
 """Where the picture of a shared model goes, which browsers show before any script has run."""
 
-PICTURE = "preview.jpg"
-"""The file with the picture of a model."""
+PICTURES = (POSTER, "preview.jpg")
+"""The files with a picture of a model, the first before the second."""
 
 _FOREVER = "public, max-age=31536000, immutable"
 _METHODS = ["GET", "HEAD"]
@@ -150,9 +150,9 @@ def _shared(service: Service, request: Request, token: str, *, embedded: bool) -
     try:
         model = service.shares.get_model(service.shares.get(token))
         head = _card(str(request.base_url), token, model)
-        if _has_picture(model):
+        if (picture := _picture(model)) is not None:
             said = escape(f"A picture of {model.name or 'the scene'}")
-            poster = f'<img class="still" src="/s/{token}/model/files/{PICTURE}" alt="{said}" fetchpriority="high">'
+            poster = f'<img class="still" src="/s/{token}/model/files/{picture}" alt="{said}" fetchpriority="high">'
     except ProblemError as error:
         status = error.problem.status
     name = "share/embed.html" if embedded else "share/share.html"
@@ -162,8 +162,10 @@ def _shared(service: Service, request: Request, token: str, *, embedded: bool) -
     return shown
 
 
-def _has_picture(model: SharedModel) -> bool:
-    return any(file.name == PICTURE for file in model.files)
+def _picture(model: SharedModel) -> str | None:
+    """Return the file with the picture of a model; None where it has none."""
+    names = {file.name for file in model.files}
+    return next((picture for picture in PICTURES if picture in names), None)
 
 
 def _card(base: str, token: str, model: SharedModel) -> str:
@@ -173,12 +175,11 @@ def _card(base: str, token: str, model: SharedModel) -> str:
         "og:type": "website",
         "og:title": model.name or "A scene in 3D",
         "og:description": f"{model.gaussians:,} Gaussians{quality}. Look at it from any side.",
-        "og:image": f"{base}s/{token}/model/files/{PICTURE}",
         "og:url": f"{base}s/{token}",
         "twitter:card": "summary_large_image",
     }
-    if not _has_picture(model):
-        del card["og:image"]
+    if (picture := _picture(model)) is not None:
+        card["og:image"] = f"{base}s/{token}/model/files/{picture}"
     return "".join(f'\n<meta property="{name}" content="{escape(text)}">' for name, text in card.items())
 
 

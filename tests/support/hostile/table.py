@@ -11,6 +11,7 @@ from tests.support.hostile.table_lenses import LENSES
 from tests.support.hostile.table_models import MODELS
 from tests.support.hostile.table_others import OTHERS
 from tests.support.hostile.table_poses import POSES
+from tests.support.hostile.table_presentation import PRESENTATION
 from tests.support.hostile.table_programs import PROGRAMS
 from tests.support.hostile.table_proxies import PROXIES
 from tests.support.hostile.table_requests import REQUESTS
@@ -26,6 +27,7 @@ HOSTILE: tuple[Hostile, ...] = (
     *FILES,
     *UNPACKED,
     *POSES,
+    *PRESENTATION,
     *PROGRAMS,
     *LENSES,
     *MODELS,

@@ -29,6 +29,8 @@ models/{id}/formats/{format}.json           what the conversion cost and lost; w
 models/{id}/orbits/{orbit}/orbit.json       record of an orbit video, and how many of its frames are stored
 models/{id}/orbits/{orbit}/frames/{n}.mp4   some of its frames, from the n-th on, until the video is whole
 models/{id}/orbits/{orbit}/orbit.mp4        the video
+models/{id}/presentation.json               how the model is shown to people: start view, measurements, annotations
+models/{id}/poster.jpg                      its picture from the start view that was chosen for it
 models/{id}/job.json                        record of the ended job; written last: a model exists once it does
 names/{job}.json                            the name that a job was given after it was made, and its model with it
 bin/{kind}.{id}.json                        record in the bin, kind job or capture: who it belongs to, and when it goes
@@ -41,7 +43,7 @@ The id of a model is that of the job that made it.
 
 import re
 
-from splatmill.schema import HELD_OUT, TIME_LAPSE, Role
+from splatmill.schema import HELD_OUT, POSTER, TIME_LAPSE, Role
 from splatmill.schema.ids import ID
 
 MODEL_FILES = {
@@ -54,6 +56,7 @@ MODEL_FILES = {
     "frame.json": "application/json",
     "job.json": "application/json",
     "preview.jpg": "image/jpeg",
+    POSTER: "image/jpeg",
     "progress.mp4": "video/mp4",
 }
 """The files that a model may have, with their media types."""
@@ -255,6 +258,11 @@ def model(model_id: str) -> str:
 
 def model_file(model_id: str, name: str) -> str:
     return f"models/{model_id}/{name}"
+
+
+def presentation(model_id: str) -> str:
+    """Return the path of how a model is shown to people, a `Presentation`. Only the server writes it."""
+    return f"models/{model_id}/presentation.json"
 
 
 def conversion(model_id: str, key: str) -> str:

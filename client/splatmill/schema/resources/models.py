@@ -18,7 +18,8 @@ TIME_LAPSE = "time_lapse"
 
 class ModelFile(Response):
     """A file of a model: model.ply, report.json, report.png, report.html, cameras.json, cameras.zip, frame.json,
-    preview.jpg, progress.mp4, the held-out photos in held_out/, and the snapshots of the training in time_lapse/."""
+    preview.jpg, poster.jpg, progress.mp4, the held-out photos in held_out/, and the snapshots of the training in
+    time_lapse/."""
 
     name: str
     size: int = Field(ge=0, description="Size in bytes.")

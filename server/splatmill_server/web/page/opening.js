@@ -1,6 +1,7 @@
 // A stored model in the viewer: its picture at once, and then the model from the smallest file that the viewer draws.
 
 import { get, request } from "./api.js";
+import { POSTER, PREVIEW, pictureOf } from "./picture.js";
 import { open } from "./viewer.js";
 
 /** Bytes of a model.ply that is loaded as it is: a smaller file of it would hardly be seen sooner. */
@@ -16,18 +17,24 @@ const SMALLEST = "sog";
  * @param {string} model.address that of the model, as /v1/models/ID
  * @param {{name: string}[]} model.files
  * @param {any[]} model.cameras those of the photos
+ * @param {import("./viewer/presented.js").Presentation} model.presentation how its owner wants it to be shown
  * @param {boolean} [model.waits] whether to wait until the server has made the smallest file, where it has not yet
  * @param {import("./viewer.js").Options} options others than those for the source and the cameras
  */
-export function openModel(box, { address, files, cameras, waits = false }, options) {
+export function openModel(box, { address, files, cameras, presentation, waits = false }, options) {
   // The worker takes the picture from where the first held-out photo was taken, or else the first photo of all.
-  const shown = cameras.find(({ split }) => split === "test") ?? cameras[0];
-  const poster = shown && files.some(({ name }) => name === "preview.jpg");
+  const first = (cameras.find(({ split }) => split === "test") ?? cameras[0])?.camera;
+  const picture = pictureOf(files);
+  const camera = presentation.start_view ?? (picture ? first : undefined);
+  // The picture from the start view is the only one that a start view has.
+  const poster = camera && picture === (presentation.start_view ? POSTER : PREVIEW) ? `${address}/files/${picture}` : undefined;
   return open(box, {
+    background: presentation.background,
     ...options,
     model: address,
     cameras: cameras.map(({ camera }) => camera),
-    ...(poster ? { camera: shown.camera, poster: `${address}/files/preview.jpg` } : {}),
+    camera,
+    poster,
     find: (say) => smallest(address, waits, say),
   });
 }

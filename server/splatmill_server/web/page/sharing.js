@@ -32,7 +32,7 @@ export async function openSharing(address, name) {
     h("div", { class: "stack" },
       h("div", { class: "row" }, h("h2", { id: "sharing-title" }, `Share ${name}`),
         h("button", { class: "quiet small push", type: "button", "aria-label": "Close", onclick: () => dialog.close() }, "✕")),
-      h("p", {}, "Whoever has the link can look at this model and download it, without a key, until the link ends. With it go its picture, the film of its training, the curve of its error, the names of the photo files, and where each photo was taken relative to the scene. It is listed nowhere."),
+      h("p", {}, "Whoever has the link can look at this model and download it, without a key, until the link ends. With it go its picture, its annotations and measurements, the film of its training, the curve of its error, the names of the photo files, and where each photo was taken relative to the scene. It is listed nowhere."),
       form, trouble, made, list));
 
   /** Do what may fail, and say it in the dialog. @param {() => Promise<void>} work */

@@ -5,6 +5,8 @@
  *     view.frame(cameras[0]);
  *     await view.replace({ bytes });        // the camera stays
  *     view.showCameras([{ name, camera, color }]);
+ *     const point = await view.pointAt(x, y); // in the coordinates of the model
+ *     const file = await view.picture();
  *     view.addEventListener("move", () => view.getCamera());
  *     view.dispose();
  *
@@ -13,11 +15,12 @@
  * @import {Line, ShownCamera} from "./viewer/overlay.js"
  */
 import { bytes } from "./format.js";
+import { depthOfPixel } from "./viewer/depth.js";
 import { Pictures } from "./viewer/pictures_view.js";
 import { Controls, HELP } from "./viewer/controls.js";
 import { ViewerError } from "./viewer/errors.js";
 import { Overlay } from "./viewer/overlay.js";
-import { denseMiddle, dot, length, lookingAt, matrixOf, poseOf, sub, surroundings, tangentsOf } from "./viewer/pose.js";
+import { add, denseMiddle, dot, length, lookingAt, matrixOf, poseOf, projected, sub, surroundings, tangentsOf, times } from "./viewer/pose.js";
 import { Splats, hasWebGL } from "./viewer/splats.js";
 
 export { ViewerError };
@@ -32,6 +35,8 @@ const NEAR = 0.002;
 const FAR = 1e4;
 /** Depth of the drawn frusta, over the same distance. */
 const FRUSTUM = 0.07;
+/** Milliseconds in which the view turns to a point that was double-clicked. */
+const TURN_MS = 350;
 
 /**
  * @typedef {Object} Options
@@ -68,7 +73,10 @@ export async function open(container, options) {
   return view;
 }
 
-/** A view. Events: `move` (the camera moved), `frame` (one was drawn), `pick` (x, y), `pick-camera` (name), `trouble`. */
+/**
+ * A view. Events: `move` (the camera moved), `hand` (somebody moves it), `frame` (one was drawn), `pick` (x, y),
+ * `pick-camera` (name), `trouble`.
+ */
 export class View extends EventTarget {
   /** @param {HTMLElement} container @param {Options} options */
   constructor(container, options) {
@@ -99,6 +107,8 @@ export class View extends EventTarget {
     this.pending = 0;
     this.resized = true;
     this.ratio = 1;
+    /** Whether clicks mark points, so that a double click does not turn the view. */
+    this.aims = false;
     this.home = this.pose;
     this.homeDistance = this.distance;
     this.homeTangents = this.tangents;
@@ -128,9 +138,13 @@ export class View extends EventTarget {
     }
     container.append(this.element);
     this.controls = new Controls(this.element, this, {
-      moved: () => this.moved(),
+      moved: () => {
+        this.dispatchEvent(new Event("hand"));
+        this.moved();
+      },
       home: () => this.goHome(),
       picked: (x, y) => this.picked(x, y),
+      twice: (x, y) => void this.lookAtPlace(x, y),
     });
     this.watch = new ResizeObserver(() => {
       this.resized = true;
@@ -140,6 +154,7 @@ export class View extends EventTarget {
     if (options.cameras?.length) this.surround(options.cameras);
     if (options.camera) {
       this.setCamera(options.camera);
+      this.tangents = tangentsOf(options.camera); // all that its picture shows is to be seen
       this.settle();
     }
   }
@@ -268,6 +283,67 @@ export class View extends EventTarget {
     this.tangents = tangentsOf(camera);
     this.settle();
     this.moved();
+  }
+
+  /** Pixels of the view, in CSS pixels, per unit of length at distance 1. */
+  get focal() {
+    return this.canvas.clientHeight / 2 / Math.tan(this.fovY / 2);
+  }
+
+  /** Where a point is seen, in CSS pixels, and how far ahead it is. @param {Vec} point */
+  project(point) {
+    return projected(this.pose, point, this.focal, this.canvas.clientWidth, this.canvas.clientHeight);
+  }
+
+  /**
+   * The point of the scene that is seen at a place of the view; null where there is nothing. Of a stored model, the
+   * server's renderer measures it; of others, it is the nearest Gaussian that is not transparent there.
+   * @param {number} x @param {number} y  CSS pixels
+   * @returns {Promise<Vec | null>}
+   */
+  async pointAt(x, y) {
+    const { pose, focal, canvas, surface } = this;
+    const [dx, dy] = [(x - canvas.clientWidth / 2) / focal, (y - canvas.clientHeight / 2) / focal];
+    const drawn = () => (surface instanceof Splats ? surface.depthAt(x * this.ratio, y * this.ratio) : null);
+    const { model } = this.options;
+    const depth = await (model ? depthOfPixel(model, pose, dx, dy, focal) : drawn());
+    if (!depth) return null;
+    return add(pose.position, times(add(pose.forward, add(times(pose.right, dx), times(pose.down, dy))), depth));
+  }
+
+  /** Turn to what is seen at a place, which becomes the point that the view turns about. @param {number} x @param {number} y */
+  async lookAtPlace(x, y) {
+    if (this.aims) return;
+    const point = await this.pointAt(x, y).catch(() => null); // without the server, nothing is turned to
+    if (point) this.lookAt(point);
+  }
+
+  /** Turn to a point, which becomes the one that the view turns about. @param {Vec} point */
+  lookAt(point) {
+    const { position, forward } = this.pose;
+    const before = add(position, times(forward, this.distance));
+    const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
+    const began = performance.now();
+    /** @param {number} now */
+    const step = (now) => {
+      if (this.pose.position !== position) return; // somebody has moved the camera
+      const share = still ? 1 : Math.min(1, (now - began) / TURN_MS);
+      const target = add(times(before, 1 - share), times(point, share));
+      this.pose = { ...lookingAt(position, target, this.up), position };
+      this.distance = Math.max(length(sub(target, position)), 1e-3);
+      this.moved();
+      if (share < 1 && this.surface) requestAnimationFrame(step);
+    };
+    step(began);
+  }
+
+  /** The view as a picture, without what is drawn over it. @returns {Promise<Blob>} a PNG */
+  picture() {
+    cancelAnimationFrame(this.pending);
+    this.draw(); // what WebGL drew is there until the browser shows it
+    return new Promise((resolve, reject) => {
+      this.canvas.toBlob((blob) => (blob ? resolve(blob) : reject(new Error("The browser made no picture of the view."))), "image/png");
+    });
   }
 
   /** Make the present view that of `goHome`. */

@@ -13,7 +13,7 @@ import redis
 from splatmill.backplane.jobs.published import is_published
 from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.storage import Storage
-from splatmill.schema import JobState, StateEvent
+from splatmill.schema import POSTER, JobState, StateEvent
 from splatmill_worker.service.attempts.attempt import Attempt
 from splatmill_worker.service.attempts.publish import publish
 from splatmill_worker.service.lock import JobLock
@@ -67,8 +67,10 @@ def test_files_in_folders_are_those_of_the_last_generation(
     assert digests["held_out/000.webp"] == hashlib.sha256(b"held_out/000.webp").hexdigest()
     for name in ("held_out/001.webp", "time_lapse/000.ply"):
         (tmp_path / name).unlink()
+    local.put(layout.model_file(JOB, POSTER), b"what the first generation looked like")
+    local.put(layout.presentation(JOB), b"{}")
     publish(local, attempt(connection, 2), row, tmp_path, room)
-    assert stored() == common
+    assert stored() == common | {"presentation.json"}, "what people have written is kept"
 
 
 def test_without_a_model_nothing_is_published(

@@ -11,7 +11,7 @@ from splatmill.backplane.jobs.row import JobRow, now
 from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.records import FORMAT
 from splatmill.backplane.storage.storage import Storage
-from splatmill.schema import JobState
+from splatmill.schema import POSTER, JobState
 from splatmill_worker.service.attempts.attempt import Attempt
 from splatmill_worker.service.redis_patience import patiently
 from splatmill_worker.service.room import Room
@@ -46,8 +46,8 @@ def publish(storage: Storage, attempt: Attempt, row: JobRow, out: Path, room: Ro
     digests: dict[str, str] = {}
     for entry in storage.entries(layout.model(attempt.job_id)):
         name = entry.path.removeprefix(layout.model(attempt.job_id) + "/")
-        if "/" in name and name not in names:
-            storage.delete(entry.path)  # of an earlier generation that had more of them
+        if name == POSTER or ("/" in name and name not in names):
+            storage.delete(entry.path)  # of an earlier generation, which looked otherwise or had more of them
     for name in names:
         path = out / name
         if name != _RECORD and path.is_file():

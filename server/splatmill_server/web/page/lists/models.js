@@ -5,6 +5,7 @@ import { putInBin } from "../bin.js";
 import { append, byId, h } from "../dom.js";
 import { ago, bytes, decibels, moment, number } from "../format.js";
 import { listing } from "./listing.js";
+import { pictureOf } from "../picture.js";
 import { openSharing } from "../sharing.js";
 import { startShell } from "../shell.js";
 import { showBin } from "./bin_table.js";
@@ -12,10 +13,10 @@ import { showBin } from "./bin_table.js";
 /** @param {any} model */
 function entry(model) {
   const name = model.name || `Model ${model.id.slice(0, 8)}`;
-  const hasPicture = model.files.some((/** @type {any} */ file) => file.name === "preview.jpg");
+  const picture = pictureOf(model.files);
   return h("li", { class: "tile" },
-    hasPicture
-      ? h("img", { class: "poster", src: `/v1/models/${model.id}/files/preview.jpg`, alt: "", loading: "lazy" })
+    picture
+      ? h("img", { class: "poster", src: `/v1/models/${model.id}/files/${picture}`, alt: "", loading: "lazy" })
       : h("div", { class: "poster none", "aria-hidden": "true" }, "no picture"),
     h("div", { class: "body" },
       h("a", { class: "whole", href: `/models/${model.id}` }, name),

@@ -31,6 +31,7 @@ const FILES = {
   "report.png": "Error against run time",
   "progress.mp4": "Video of the training",
   "preview.jpg": "A picture of the model",
+  "poster.jpg": "The picture from the start view, which links show",
 };
 
 /** Key of the format that the one-file page holds. */

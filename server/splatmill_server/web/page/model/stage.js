@@ -1,15 +1,21 @@
-// The viewer of the model's page with its tools: kinds of view, cameras, far background, time-lapse, measuring.
+// The viewer of the model's page with its tools.
 
+import { send } from "../api.js";
 import { byId, h, toggle } from "../dom.js";
 import { openModel } from "../opening.js";
-import { noticeOf } from "../shell.js";
+import { noticeOf, notify } from "../shell.js";
 import { GRADIENT } from "../viewer/depth.js";
 import { HELP } from "../viewer/controls.js";
+import { savePicture } from "../viewer/presented.js";
+import { Turning } from "../viewer/turning.js";
+import { Annotate } from "./annotate.js";
 import { Edit } from "./edit.js";
 import { Measure } from "./measure.js";
 import { timeLapse } from "./time_lapse.js";
+import { Visitors } from "./visitors.js";
 
 /**
+ * @import {Aim} from "./aim.js"
  * @import {Shown} from "./model.js"
  * @import {View} from "../viewer.js"
  */
@@ -24,6 +30,9 @@ export class Stage {
   /** @param {Shown} shown */
   constructor(shown) {
     this.shown = shown;
+    this.presentation = shown.presentation;
+    /** @type {Turning | null} */
+    this.turning = null;
     /** @type {View | null} */
     this.view = null;
     const { plan, facts } = shown.report;
@@ -37,17 +46,24 @@ export class Stage {
       h("option", { value: "webgl" }, "3D"), h("option", { value: "pictures" }, "Pictures by the server"), h("option", { value: "depth" }, "Depth"));
     this.camerasButton = toggle("Cameras", (on) => this.toggleCameras(on));
     this.farButton = toggle("Hide far background", (on) => this.hideFar(on));
+    this.turnButton = toggle("Turn slowly", (on) => this.turning?.turn(on));
     this.measure = new Measure(this);
+    this.annotate = new Annotate(this);
+    this.visitors = new Visitors(this);
     this.edit = new Edit(this);
     this.scale = h("div", { class: "depth-scale number", hidden: true });
     byId("toolbar").append(this.kind,
       h("button", { type: "button", onclick: () => this.view?.goHome() }, "Start view"),
       shown.cameras.length ? this.camerasButton : "",
       this.shell ? this.farButton : "",
+      this.turnButton,
       this.measure.button,
+      this.annotate.button,
       this.edit.button,
+      this.visitors.button,
+      h("button", { type: "button", onclick: () => void this.savePicture() }, "Save a picture"),
       document.fullscreenEnabled ? h("button", { type: "button", class: "push", onclick: () => void byId("viewer").requestFullscreen() }, "Full screen") : "");
-    byId("panels").append(this.scale, this.measure.panel, this.edit.panel);
+    byId("panels").append(this.scale, this.measure.panel, this.annotate.panel, this.edit.panel, this.visitors.panel);
   }
 
   /** Open the view of a kind, with the camera of the one before. @param {"webgl" | "pictures" | "depth"} kind */
@@ -57,7 +73,7 @@ export class Stage {
     this.view?.dispose();
     this.view = null;
     try {
-      this.view = await openModel(byId("viewer"), { ...shown, files: shown.model.files }, {
+      this.view = await openModel(byId("viewer"), { ...shown, presentation: this.presentation, files: shown.model.files }, {
         kind,
         antialias: antialias(shown.report),
         background: shown.background,
@@ -81,8 +97,12 @@ export class Stage {
       const { name } = /** @type {CustomEvent} */ (event).detail;
       this.lookFrom(shown.cameras.find((entry) => entry.name === name));
     });
+    this.turnButton.setAttribute("aria-pressed", "false");
+    this.turning = new Turning(view, (on) => this.turnButton.setAttribute("aria-pressed", String(on)));
     this.scale.hidden = view.kind !== "depth";
     this.measure.attach(view);
+    this.annotate.attach(view);
+    this.aim(null);
     this.edit.attach(view);
     this.toggleCameras(this.showing.cameras);
     this.hideFar(this.showing.hidden);
@@ -93,6 +113,28 @@ export class Stage {
     }
     this.lapse?.available(view.kind === "webgl");
     byId("viewer").dataset.ready = view.kind;
+  }
+
+  /** Let clicks mark points where a tool wants them, which is one at a time. @param {Aim | null} tool that was turned on or off */
+  aim(tool) {
+    const tools = [this.measure, this.annotate];
+    for (const other of tools) if (tool?.on && other !== tool && other.on) other.button.click();
+    const on = tools.some((each) => each.on);
+    byId("viewer").classList.toggle("aims", on);
+    if (this.view) this.view.aims = on;
+  }
+
+  /** Change how the model is shown to people. @param {Partial<import("../viewer/presented.js").Presentation>} change */
+  async save(change) {
+    this.presentation = await send("PATCH", `${this.shown.address}/presentation`, change);
+  }
+
+  async savePicture() {
+    try {
+      if (this.view) await savePicture(this.view, this.shown.model.name || this.shown.model.id);
+    } catch (error) {
+      notify(/** @type {Error} */ (error));
+    }
   }
 
   /** @param {string} kind */

@@ -35,8 +35,11 @@ export async function showShared() {
 async function view(box, model, name) {
   try {
     const has = model.files.some((/** @type {any} */ file) => file.name === "cameras.json");
-    const [{ cameras }, { openModel }] = await Promise.all([has ? get(`${address}/cameras`) : { cameras: [] }, import("../opening.js")]);
-    await openModel(box, { address, files: model.files, cameras, waits: true }, { antialias: model.antialias, label: name });
+    const [{ cameras }, presentation, { openModel }, { present }] = await Promise.all([
+      has ? get(`${address}/cameras`) : { cameras: [] }, get(`${address}/presentation`), import("../opening.js"), import("../viewer/presented.js"),
+    ]);
+    const shown = { address, files: model.files, cameras, presentation, waits: true };
+    present(box, await openModel(box, shown, { antialias: model.antialias, label: name }), presentation, name);
   } catch (error) {
     // The picture of the model, which the page came with, stays.
     box.append(noticeOf(/** @type {Error} */ (error), "warning"));

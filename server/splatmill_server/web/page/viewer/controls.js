@@ -38,7 +38,7 @@ const KEYS = new Map(
 
 export const HELP =
   "Drag or arrow keys: turn. Wheel, pinch or + and -: nearer and farther. Right button, Shift or two fingers: move " +
-  "sideways. W A S D Q E: fly. Home: back to the start.";
+  "sideways. Double click: turn about that point. W A S D Q E: fly. Home: back to the start.";
 
 /**
  * @typedef {Object} Movable  what is moved
@@ -52,8 +52,9 @@ export class Controls {
   /**
    * @param {HTMLElement} element  gets the pointers and the keys
    * @param {Movable} movable
-   * @param {{moved: () => void, home: () => void, picked: (x: number, y: number) => void}} on
-   *   moved: after each change of the pose. home: the key Home. picked: a click, in CSS pixels of the element.
+   * @param {{moved: () => void, home: () => void, picked: (x: number, y: number) => void, twice?: (x: number, y: number) => void}} on
+   *   moved: after each change of the pose. home: the key Home. picked, twice: a click and a double click, in CSS pixels of
+   *   the element.
    */
   constructor(element, movable, on) {
     this.element = element;
@@ -73,6 +74,7 @@ export class Controls {
     element.addEventListener("pointermove", (event) => this.move(event), { signal });
     element.addEventListener("pointerup", (event) => this.up(event, true), { signal });
     element.addEventListener("pointercancel", (event) => this.up(event, false), { signal });
+    element.addEventListener("dblclick", (event) => this.on.twice?.(...this.place(event)), { signal });
     element.addEventListener("wheel", (event) => this.wheel(event), { signal, passive: false });
     element.addEventListener("contextmenu", (event) => event.preventDefault(), { signal });
     element.addEventListener("keydown", (event) => this.keyDown(event), { signal });
@@ -119,10 +121,15 @@ export class Controls {
   up(event, released) {
     this.pointers.delete(event.pointerId);
     if (released && this.start && event.button === 0) {
-      const box = this.element.getBoundingClientRect();
-      this.on.picked(event.clientX - box.left, event.clientY - box.top);
+      this.on.picked(...this.place(event));
     }
     this.start = null;
+  }
+
+  /** Where an event is, in CSS pixels of the element. @param {MouseEvent} event @returns {[number, number]} */
+  place(event) {
+    const box = this.element.getBoundingClientRect();
+    return [event.clientX - box.left, event.clientY - box.top];
   }
 
   /** @param {WheelEvent} event */

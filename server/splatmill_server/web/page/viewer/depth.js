@@ -1,4 +1,29 @@
-/** Distances rendered by the server: reading them, and showing them as colours. */
+/**
+ * Distances rendered by the server: asking for them, reading them, and showing them as colours.
+ *
+ * @import {Pose} from "./pose.js"
+ */
+import { matrixOf } from "./pose.js";
+
+/**
+ * How far ahead a stored model is at a place of a view, which the server renders as one pixel; null where nothing is.
+ * @param {string} model  address of the model, as /v1/models/{id}
+ * @param {Pose} pose @param {number} dx @param {number} dy  of the place, at distance 1 @param {number} focal  pixels
+ * @returns {Promise<number | null>}  throws an Error with the server's reason
+ */
+export async function depthOfPixel(model, pose, dx, dy, focal) {
+  const camera = { width: 1, height: 1, fx: focal, fy: focal, cx: 0.5 - dx * focal, cy: 0.5 - dy * focal };
+  const fields = { ...camera, camera_to_world: matrixOf(pose).flat().join(","), output: "depth", format: "npy" };
+  const query = new URLSearchParams(Object.entries(fields).map(([name, value]) => [name, `${value}`]));
+  const answer = await fetch(`${model}/render?${query}`).catch(() => null);
+  if (!answer) throw new Error("The server could not be reached for the distance.");
+  if (!answer.ok) {
+    const problem = await answer.json().catch(() => ({}));
+    throw new Error(problem.detail ?? `The server answered ${answer.status} in place of the distance.`);
+  }
+  const [depth] = readArray(await answer.arrayBuffer()).data;
+  return depth > 0 ? depth : null;
+}
 
 /**
  * Read an array of float32 in NumPy's format, version 1, in C order.

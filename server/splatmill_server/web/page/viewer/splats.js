@@ -86,6 +86,8 @@ export class Splats {
     device.on("devicerestored", () => this.again());
     /** @type {any} */
     this.splats = null;
+    /** @type {any} */
+    this.picker = null;
     this.gaussians = 0;
     this.loads = 0;
   }
@@ -168,7 +170,22 @@ export class Splats {
     if (this.sorted) this.drawn();
   }
 
+  /**
+   * How far ahead the nearest Gaussian is that is seen at a pixel; null where there is none.
+   * @param {number} x @param {number} y  pixels of the canvas
+   * @returns {Promise<number | null>}
+   */
+  async depthAt(x, y) {
+    const { app, pc, canvas, eye } = this;
+    this.picker ??= new pc.Picker(app, canvas.width, canvas.height, true);
+    this.picker.resize(canvas.width, canvas.height);
+    this.picker.prepare(eye.camera, app.scene);
+    const point = await this.picker.getWorldPointAsync(x, y);
+    return point ? point.sub(eye.getPosition()).dot(eye.forward) : null;
+  }
+
   dispose() {
+    this.picker?.destroy();
     const { app } = this;
     this.app = null;
     app?.destroy();
