@@ -59,6 +59,9 @@ def test_the_file_draws_the_model_and_asks_for_nothing(browser: Browser, tmp_pat
         assert page.locator("#said").text_content() == ""
         assert page.title() == name
         assert page.evaluate("[view.kind, view.gaussians]") == ["webgl", 800]
+        assert page.evaluate("getComputedStyle(view.element).touchAction") == "none", (
+            "there is no page to scroll"
+        )
         page.evaluate("globalThis.before = -1")
         page.wait_for_function(
             "() => { const same = view.frames === before; globalThis.before = view.frames; return same; }",

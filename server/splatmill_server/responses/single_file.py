@@ -27,6 +27,8 @@ _RELATIVE = re.compile(r'(\bfrom |\bimport\()"(\.{1,2}/[^"]+)"')
 _STYLE = """
 html, body { margin: 0; height: 100%; background: #000; color: #ddd; font: 16px/1.5 system-ui, sans-serif; }
 #view { position: fixed; inset: 0; }
+#view .view { touch-action: none; }
+#view .view :is(.enter, .leave) { display: none; }
 #said { position: fixed; inset: auto 0 0 0; margin: 0; padding: 0.5rem 1rem; background: #000a; }
 #said:empty { display: none; }
 """

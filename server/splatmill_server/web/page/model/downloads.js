@@ -47,12 +47,13 @@ export async function showDownloads(section, { model, address }) {
   const files = Object.keys(FILES).filter((name) => sizes.has(name)).map((name) => ({
     name, href: `${address}/files/${name}`, what: FILES[name], size: sizes.get(name),
   }));
-  const body = h("tbody");
+  // The roles are named because the layout on phones would take them away.
+  const body = h("tbody", { role: "rowgroup" });
   const state = h("div", { role: "status" });
   section.append(h("h2", { id: "downloads-title" }, "Downloads"),
-    h("div", { class: "scroll" }, h("table", { class: "table" },
-      h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "File"), h("th", { scope: "col", class: "number" }, "Size"),
-        h("th", { scope: "col", class: "number" }, "PSNR"))),
+    h("div", { class: "scroll" }, h("table", { class: "table", role: "table" },
+      h("thead", { role: "rowgroup" }, h("tr", { role: "row" }, ["File", "Size", "PSNR"].map((text, i) =>
+        h("th", { scope: "col", role: "columnheader", class: i > 0 && "number" }, text)))),
       body)),
     state);
   /** The addresses whose files are being made. @type {Set<string>} */
@@ -135,8 +136,8 @@ function qualityOf(conversion) {
  */
 function rowOf({ name, href, what, size, psnr = "", loss = "", madeAt }, making, onAsked) {
   const unmade = madeAt && making.has(madeAt) ? "being made" : "made on demand";
-  return h("tr", {},
-    h("td", {}, h("a", { href, download: "", onclick: onAsked }, name), h("div", { class: "muted small" }, what)),
-    h("td", { class: "number" }, size === null ? unmade : bytes(size)),
-    h("td", { class: "number" }, psnr, loss && h("div", { class: "muted small" }, loss)));
+  return h("tr", { role: "row" },
+    h("td", { role: "cell" }, h("a", { href, download: "", onclick: onAsked }, name), h("div", { class: "muted small" }, what)),
+    h("td", { role: "cell", class: "number" }, size === null ? unmade : bytes(size)),
+    h("td", { role: "cell", class: "number" }, psnr, loss && h("div", { class: "muted small" }, loss)));
 }

@@ -4,6 +4,7 @@
  * @import {Pose, Vec} from "./pose.js"
  */
 import { add, dot, length, sub, times, turnedAbout } from "./pose.js";
+import { enterable } from "./touch.js";
 
 /** Radians of orbit for a drag over the whole height of the view. */
 const TURN = Math.PI;
@@ -70,6 +71,7 @@ export class Controls {
     this.last = 0;
     this.ended = new AbortController();
     const signal = this.ended.signal;
+    this.enter = enterable(element, signal);
     element.addEventListener("pointerdown", (event) => this.down(event), { signal });
     element.addEventListener("pointermove", (event) => this.move(event), { signal });
     element.addEventListener("pointerup", (event) => this.up(event, true), { signal });
@@ -121,6 +123,7 @@ export class Controls {
   up(event, released) {
     this.pointers.delete(event.pointerId);
     if (released && this.start && event.button === 0) {
+      if (event.pointerType === "touch") this.enter();
       this.on.picked(...this.place(event));
     }
     this.start = null;
