@@ -25,6 +25,7 @@ from splatmill.backplane.storage.storage import Storage, StorageError
 from splatmill_server.access.exposure import NeedsKey
 from splatmill_server.app import create_app
 from splatmill_server.base.settings import Settings
+from splatmill_server.base.tls import uvicorn_options
 
 log = structlog.get_logger()
 
@@ -62,6 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         settings = Settings(**{name: value for name, value in arguments_by_name.items() if value is not None})
         configure_logging(settings.log_format)
         os.umask(settings.file_mask)
+        tls_options = uvicorn_options(settings)
         app = create_app(settings)
         listener = listen(settings)
     except ValidationError as error:
@@ -71,7 +73,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (StorageError, OSError, InvalidRedisUrl, NeedsKey) as error:
         print(f"splatmill_server: {error}", file=sys.stderr)
         return 2
-    config = uvicorn.Config(app, log_config=None, access_log=False, timeout_graceful_shutdown=GRACE_SECONDS)
+    config = uvicorn.Config(
+        app, log_config=None, access_log=False, timeout_graceful_shutdown=GRACE_SECONDS, **tls_options
+    )
     log.info("serving", address=_address(listener), storage=redacted(settings.storage))
     _check_modes(app.state.service.storage, settings)
     server = Server(config, app)

@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from splatmill.schema.files.outputs import OUTPUT_MARKS, OUTPUT_MEDIA
     from splatmill.schema.files.photos import (
         ARCHIVE_SUFFIXES,
+        EXAMPLE_FILE,
         MASK_SUFFIXES,
         MAX_PHOTO_PIXELS,
         MIN_PHOTO_SIDE,
@@ -157,6 +158,7 @@ if TYPE_CHECKING:
         Accepted,
         Health,
         Info,
+        Lan,
         Limits,
         QueueInfo,
         Ready,
@@ -245,6 +247,7 @@ __all__ = [
     "DOWNLOADS",
     "EDIT_HEADER",
     "EVENT",
+    "EXAMPLE_FILE",
     "FINAL_STATES",
     "HELD_OUT",
     "IDEMPOTENCY_HEADER",
@@ -339,6 +342,7 @@ __all__ = [
     "KeyWithSecret",
     "Kind",
     "KnownDistance",
+    "Lan",
     "Limits",
     "LogEvent",
     "LogLine",

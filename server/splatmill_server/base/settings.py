@@ -60,6 +60,17 @@ class Settings(BaseSettings):
         default=None, description="Path of a unix socket to listen on, in place of host and port."
     )
 
+    tls_certificate: Path | None = Field(
+        default=None, description="Certificate in PEM. Where it is set, the server answers over HTTPS alone."
+    )
+    tls_key: Path | None = Field(
+        default=None, description="Private key of the certificate in PEM; left out, it is in the same file."
+    )
+    lan_url: str | None = Field(
+        default=None,
+        description="Address under which devices of the local network reach the server, for the pages that name it.",
+    )
+
     allowed_hosts: str = Field(
         default="",
         description="Names of proxies before the server, separated by commas; `*.example.org` stands for all names "

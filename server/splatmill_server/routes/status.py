@@ -21,6 +21,7 @@ from splatmill.backplane.rendering import RendererState
 from splatmill.data_sets import LARGE, LISTS, OTHER_CAMERAS, PROGRAM_FILES
 from splatmill.schema import (
     ARCHIVE_SUFFIXES,
+    EXAMPLE_FILE,
     MASK_BEGINNINGS,
     MASK_ENDINGS,
     MASK_FOLDERS,
@@ -37,6 +38,7 @@ from splatmill.schema import (
     Accepted,
     Health,
     Info,
+    Lan,
     Limits,
     OptionList,
     QueueInfo,
@@ -51,6 +53,8 @@ from splatmill_server.access.caller import Caller, Who
 from splatmill_server.access.permission import needs
 from splatmill_server.base import metrics, scrape
 from splatmill_server.base.problems import LOGGED
+from splatmill_server.base.settings import Settings
+from splatmill_server.base.tls import fingerprint
 from splatmill_server.responses.docs_page import CONTENT_SECURITY_POLICY, docs_page
 from splatmill_server.routes.openapi import answer, problems
 from splatmill_server.service import Service, Shared
@@ -103,12 +107,20 @@ def get_info(service: Shared, who: Who) -> Info:
             camera_lists=list(LISTS),
             large_cameras=list(LARGE),
             other_cameras={program: list(names) for program, names in OTHER_CAMERAS.items()},
+            example=EXAMPLE_FILE,
             min_photos=MIN_PHOTOS,
             min_photo_side=MIN_PHOTO_SIDE,
         ),
         local=service.settings.local,
+        lan=_lan(service.settings),
         details={"renderer": service.renderer is not None},
     )
+
+
+def _lan(settings: Settings) -> Lan | None:
+    if settings.lan_url is None or settings.tls_certificate is None:
+        return None
+    return Lan(url=settings.lan_url, fingerprint=fingerprint(settings.tls_certificate))
 
 
 @router.get("/docs", include_in_schema=False)

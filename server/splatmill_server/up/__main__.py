@@ -8,29 +8,41 @@ import os
 import socket
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from splatmill.backplane.private_files import PRIVATE, exposure, parse_mask
 from splatmill.schema.port import DEFAULT_PORT
 from splatmill_server.up.folder import DataFolder, UpError
 from splatmill_server.up.supervisor import Supervisor
 
+if TYPE_CHECKING:
+    from splatmill_server.access.keys import Keys
+    from splatmill_server.up.lan import Lan
+
+_HOST = "127.0.0.1"
+"""The address to listen on where none is given."""
+
 
 def main(argv: list[str] | None = None) -> int:
     """Run the service until Ctrl-C, and return the exit status."""
     chosen = _parser().parse_args(argv)
-    key = os.environ.get("SPLATMILL_API_KEY") or None
     try:
         mask = _mask()
         os.environ["SPLATMILL_ROOT_PATH"] = root_path = _root_path(chosen.root_path)
+        lan = _prepare_lan(chosen) if chosen.lan else None
         with _listen(chosen.host, chosen.port, chosen.data) as listener:
             folder = DataFolder(chosen.data)
             if (exposed := exposure(folder.path, mask)) is not None:
                 _print(exposed)
             try:
-                url = _url(chosen.host, listener.getsockname()[1]) + root_path
+                port = listener.getsockname()[1]
+                url = (_url(chosen.host, port) if lan is None else lan.url(port)) + root_path
+                if lan is not None:
+                    os.environ["SPLATMILL_LAN_URL"] = url
                 supervisor = Supervisor(folder, listener, _print)
 
                 def ready() -> None:
+                    key = os.environ.get("SPLATMILL_API_KEY") or None
                     if chosen.json_ready:
                         print(json.dumps({"url": url, "api_key": key}), flush=True)
                     else:
@@ -38,6 +50,8 @@ def main(argv: list[str] | None = None) -> int:
                             f"Splatmill is ready at {url}\nData: {folder.path}\nStop it with "
                             f"Ctrl-C; unfinished jobs resume at the next start."
                         )
+                        if lan is not None:
+                            _print(lan.sentences(url, port))
 
                 supervisor.run(ready, until_closed=sys.stdin.fileno() if chosen.json_ready else None)
             finally:
@@ -74,8 +88,14 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--host",
-        default="127.0.0.1",
+        default=_HOST,
         help="address to listen on (default: %(default)s); other machines need a key",
+    )
+    parser.add_argument(
+        "--lan",
+        action="store_true",
+        help="let devices of the local network use the service: over HTTPS and with a key, which are made and printed "
+        "with a QR code for phones",
     )
     parser.add_argument(
         "--port",
@@ -101,6 +121,21 @@ def _parser() -> argparse.ArgumentParser:
         "input closes",
     )
     return parser
+
+
+def _prepare_lan(chosen: argparse.Namespace) -> "Lan":
+    """Return what `--lan` opens, and set the environment of the service for it. Raises UpError."""
+    from splatmill_server.up import lan
+
+    if chosen.host != _HOST:
+        raise UpError("--lan listens in all networks of this machine. Leave out --host, or --lan.")
+    chosen.host = lan.HOST
+    opened = lan.prepare(chosen.data, has_keys=_keys(chosen.data).any())
+    if opened.key is not None:
+        os.environ["SPLATMILL_API_KEY"] = opened.key
+    os.environ["SPLATMILL_TLS_CERTIFICATE"] = str(opened.certificate.file)
+    os.environ["SPLATMILL_TLS_KEY"] = str(opened.certificate.key)
+    return opened
 
 
 def _listen(host: str, port: int, data: Path) -> socket.socket:
@@ -136,24 +171,37 @@ def _check_exposure(address: str, data: Path) -> None:
     """Raise UpError if other machines could reach a server without keys."""
     if ipaddress.ip_address(address).is_loopback:
         return
-    from splatmill.backplane.connection import connect
-    from splatmill.backplane.storage.storage import Storage, StorageError
+    from splatmill.backplane.storage.storage import StorageError
     from splatmill_server.access.exposure import check_exposure
-    from splatmill_server.access.keys import Keys
     from splatmill_server.base.settings import Settings
 
     try:
-        settings = Settings(data=data, host=address)
-        # Only whether there are keys is read, for which no connection is opened.
-        keys = Keys(Storage(settings.storage), connect(), bootstrap=settings.api_key is not None)
-        check_exposure(settings, keys)
+        check_exposure(Settings(data=data, host=address), _keys(data))
     except (ValueError, StorageError) as error:
         raise UpError(str(error)) from error
 
 
+def _keys(data: Path) -> "Keys":
+    """Return the stored keys. Raises UpError if they cannot be read."""
+    from splatmill.backplane.connection import connect
+    from splatmill.backplane.storage.storage import Storage, StorageError
+    from splatmill_server.access.keys import Keys
+    from splatmill_server.base.settings import Settings
+
+    try:
+        settings = Settings(data=data)
+        # Only whether there are keys is read, for which no connection is opened.
+        keys = Keys(Storage(settings.storage), connect(), bootstrap=settings.api_key is not None)
+        keys.read()
+    except (ValueError, StorageError) as error:
+        raise UpError(str(error)) from error
+    return keys
+
+
 def _url(host: str, port: int) -> str:
     shown = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
-    return f"http://[{shown}]:{port}" if ":" in shown else f"http://{shown}:{port}"
+    scheme = "https" if os.environ.get("SPLATMILL_TLS_CERTIFICATE") else "http"
+    return f"{scheme}://[{shown}]:{port}" if ":" in shown else f"{scheme}://{shown}:{port}"
 
 
 def _print(text: str) -> None:

@@ -20,6 +20,7 @@ def main(descriptor: int) -> None:
         from splatmill_server.__main__ import Server, allow_open_files, configure_logging
         from splatmill_server.app import create_app
         from splatmill_server.base.settings import Settings
+        from splatmill_server.base.tls import uvicorn_options
 
     allow_open_files()
     listener = socket.socket(fileno=descriptor)
@@ -28,7 +29,13 @@ def main(descriptor: int) -> None:
     settings = Settings(host=address[0]) if isinstance(address, tuple) else Settings()
     configure_logging(settings.log_format)
     app = create_app(settings)
-    config = uvicorn.Config(app, log_config=None, access_log=False, timeout_graceful_shutdown=STOP_SECONDS)
+    config = uvicorn.Config(
+        app,
+        log_config=None,
+        access_log=False,
+        timeout_graceful_shutdown=STOP_SECONDS,
+        **uvicorn_options(settings),
+    )
     Server(config, app).run(sockets=[listener])
 
 

@@ -348,7 +348,7 @@ def _expand(
         elif suffix in ARCHIVE_SUFFIXES:
             found.skipped.append((name, "a zip inside a zip is not unpacked; give its photos themselves"))
         elif suffix in VIDEO_SUFFIXES:
-            folder = _filled_once(
+            folder = filled_once(
                 workdir / "frames" / f"{_sha256(path)[:24]}_{frames}",
                 lambda place: decoders.keyframes(path, place, frames, cancelled=cancelled),
             )
@@ -391,7 +391,7 @@ def unpacked(
         files = given_files(folder)
         allowance.take(name, len(files), _bytes_of(files))
         unpacked_room.take(folder.name, _bytes_of(files))
-    return _filled_once(folder, lambda place: archive.unpack(path, place, cancelled, allowance))
+    return filled_once(folder, lambda place: archive.unpack(path, place, cancelled, allowance))
 
 
 def names_remark(folder: Path) -> list[str]:
@@ -405,8 +405,8 @@ def _bytes_of(files: list[Path]) -> int:
     return sum(path.stat().st_size for path in files)
 
 
-def _filled_once(folder: Path, make: Callable[[Path], object]) -> Path:
-    """`folder` as filled by `make`, which is called when it does not exist yet.
+def filled_once(folder: Path, make: Callable[[Path], object]) -> Path:
+    """Return `folder` as filled by `make`, which is called when it does not exist yet.
 
     `make` fills a folder with another name, which is renamed when it is complete.
     """

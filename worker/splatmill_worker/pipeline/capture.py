@@ -13,7 +13,7 @@ from splatmill_worker.errors import Refusal
 from splatmill_worker.images import overlays
 from splatmill_worker.images.masks import mask_folder
 from splatmill_worker.images.prepare import names_remark
-from splatmill_worker.pipeline import given_points, one_place
+from splatmill_worker.pipeline import example, given_points, one_place
 from splatmill_worker.scene import Scene
 from splatmill_worker.sfm import posed
 from splatmill_worker.sfm.placed import PlacingObserver
@@ -35,7 +35,7 @@ def posed_scene(
     """Return the scene with the cameras that the capture brings, or else with cameras recovered from the photos.
 
     capture: folder with images/, and masks/ and poses/ where they were given; or the folder of a posed data set. The
-        only file in images/ may be a zip of a whole data set.
+        only file in images/ may be a zip of a whole data set, or ask for the example.
     workdir: folder where structure from motion, triangulation and stereo store their results, and from which they
         read earlier ones.
     options: only those of structure from motion are read.
@@ -45,6 +45,7 @@ def posed_scene(
 
     Raises Refusal for poses and points that cannot be used and for a scale that cannot be followed, and SfmFailed.
     """
+    capture = example.photographed_capture(capture, workdir, on_progress, cancelled)
     capture = zipped.data_set(capture, workdir, cancelled)
     try:
         given = posed.find(capture)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +26,7 @@ def capture(
     light: Light | None = None,
     movers: Movers | None = None,
     truth: Path | None = None,
+    begin: Callable[[str], None] = lambda name: None,
 ) -> dict[str, Camera]:
     """Write `count` photos of the still life to `directory`, as JPEGs with EXIF; returns the true camera of each name.
 
@@ -32,6 +34,7 @@ def capture(
     light: what the camera makes of the scene's colours; None where it keeps them.
     movers: what passes by; None where nothing does.
     truth: folder for a PNG of each photo with movers, white where they changed it; None: none are written.
+    begin: called with the name of each photo before it is made, in several threads; what it raises ends all.
     """
     directory.mkdir(parents=True, exist_ok=True)
     if truth is not None and movers is not None:
@@ -42,6 +45,7 @@ def capture(
     passing = {} if movers is None else dict(zip(cameras, movers.passing(count, seed), strict=True))
 
     def shoot(name: str) -> None:
+        begin(name)
         camera = cameras[name]
         rgb = picture(scene, camera, samples)
         if passing.get(name):

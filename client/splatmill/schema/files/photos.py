@@ -27,6 +27,10 @@ PHOTO_SUFFIXES = tuple(suffix for suffixes in PHOTO_FORMATS.values() for suffix 
 VIDEO_SUFFIXES = tuple(suffix for suffixes in VIDEO_FORMATS.values() for suffix in suffixes)
 ARCHIVE_SUFFIXES = (".zip",)
 
+EXAMPLE_FILE = "still-life.example"
+"""Name of a file among the images, of any content. Where it is a capture's only file, the worker makes photos of the
+built-in still life in its place."""
+
 MASK_SUFFIXES = tuple(sorted(PHOTO_SUFFIXES, key=lambda suffix: suffix != ".png"))
 """In the order in which the mask of a photo is searched for. Which pictures are masks: `masks.py`."""
 

@@ -91,9 +91,23 @@ class Accepted(Response):
         default_factory=dict,
         description="Programs whose cameras are not read, with patterns of the names, in lower case, of their files.",
     )
+    example: str | None = Field(
+        default=None,
+        description="Name of a file of any content among the images. Where it is the only file of a capture, a worker "
+        "makes photos of a built-in still life in its place.",
+    )
     min_photos: int = Field(description="Photos without cameras that a job needs at least.")
     min_photo_side: int = Field(
         description="Pixels; photos with a shorter side are left out of the training."
+    )
+
+
+class Lan(Response):
+    """How devices of the local network reach the server."""
+
+    url: str = Field(description="Address of the server in the network.")
+    fingerprint: str = Field(
+        description="SHA-256 of the certificate, which the server has signed itself, as browsers show it."
     )
 
 
@@ -118,6 +132,10 @@ class Info(Response):
         default=None,
         description="Whether the server listens where only its own machine reaches it; a proxy may lead to it all the "
         "same. Null on servers before this was told.",
+    )
+    lan: Lan | None = Field(
+        default=None,
+        description="The local network, where the server was started for it (`splatmill up --lan`).",
     )
     details: dict[str, Any] = Field(default_factory=dict)
 

@@ -5,6 +5,7 @@ import { putInBin } from "../bin.js";
 import { h } from "../dom.js";
 import { ago, moment, seconds } from "../format.js";
 import { FINAL, RUNNING, badgeKind, badgeText } from "../job_states.js";
+import { exampleOffer } from "../example.js";
 import { listing } from "./listing.js";
 import { confirmAction, startShell } from "../shell.js";
 
@@ -99,6 +100,6 @@ const list = await listing({
   entry,
   deleteAll: removeAll,
   deletable: (job) => FINAL.includes(job.state),
-  empty: () => h("span", {}, "There are no jobs yet. ", h("a", { href: "/" }, "Start with some photos"), "."),
+  empty: () => h("div", {}, h("p", {}, "There are no jobs yet. ", h("a", { href: "/" }, "Start with some photos"), "."), exampleOffer()),
 });
 setInterval(refresh, REFRESH_MS);

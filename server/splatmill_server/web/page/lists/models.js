@@ -4,6 +4,7 @@ import { get, modelAddress } from "../api.js";
 import { putInBin } from "../bin.js";
 import { append, byId, h } from "../dom.js";
 import { ago, bytes, decibels, moment, number } from "../format.js";
+import { exampleOffer } from "../example.js";
 import { listing } from "./listing.js";
 import { pictureOf } from "../picture.js";
 import { openSharing } from "../sharing.js";
@@ -123,6 +124,6 @@ const list = await listing({
   query: ({ name }) => ({ name }),
   entry,
   deleteAll: removeAll,
-  empty: () => h("span", {}, "There are no models yet. ", h("a", { href: "/" }, "Start with some photos"), "."),
+  empty: () => h("div", {}, h("p", {}, "There are no models yet. ", h("a", { href: "/" }, "Start with some photos"), "."), exampleOffer()),
 });
 await stored();

@@ -188,7 +188,7 @@ export class Items {
     let photos = 0;
     const isPose = (/** @type {{role: string | null, name: string}} */ file) => holdsCameras(file, this.accepted);
     let posed = others.some(isPose) || items.some(isPose);
-    let known = !others.some((file) => file.role === "images" && this.accepted.archives.includes(suffix(file.name)));
+    let known = !others.some(({ role, name }) => role === "images" && (name === this.accepted.example || this.accepted.archives.includes(suffix(name))));
     for (const name of [...items, ...others].filter((file) => file.role === "images").map((file) => suffix(file.name))) {
       if (this.accepted.photos.includes(name)) photos++;
       if (this.accepted.videos.includes(name)) photos += frames;

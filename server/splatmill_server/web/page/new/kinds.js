@@ -24,6 +24,7 @@ import { hasPhotosBeside, named } from "./documents.js";
  * @property {string[]} camera_lists patterns of the names of lists that belong to some of them
  * @property {Record<string, string[]>} other_cameras patterns of names, in lower case, by program
  * @property {string[]} large_cameras those of them whose files are not sent
+ * @property {string} example name of the file of a capture whose photos a worker makes
  * @property {number} min_photos that cameras can be recovered from, at least
  * @property {number} min_photo_side pixels
  */

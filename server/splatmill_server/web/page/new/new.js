@@ -3,6 +3,7 @@
 import { Problem, each, get, send } from "../api.js";
 import { byId, h } from "../dom.js";
 import { ago, bytes, count, number } from "../format.js";
+import { exampleOffer } from "../example.js";
 import { estimateOf } from "./estimate.js";
 import { Gallery } from "./gallery.js";
 import { documentsIn } from "./documents.js";
@@ -171,6 +172,7 @@ function redraw() {
   byId("given").hidden = !any;
   byId("settings").hidden = byId("go").hidden = !usable;
   byId("drop").classList.toggle("small-drop", any);
+  byId("example").hidden ||= any;
   byId("summary").textContent = summary();
   byId("remarks").replaceChildren(...items.remarks.map((sentence) => h("li", {}, sentence)));
   if (items.photos.every((item) => item.state !== "waiting" || item.lost)) byId("checked").textContent = summary();
@@ -241,7 +243,7 @@ async function showPhone() {
   const place = byId("phone-help");
   try {
     const { phoneHelp } = await import("./phone.js");
-    place.replaceChildren(await phoneHelp(new URL(location.pathname + location.search, location.origin), info.local ?? null, caller?.key_name !== "no key"));
+    place.replaceChildren(await phoneHelp(new URL(location.pathname + location.search, location.origin), info, caller?.key_name !== "no key"));
   } catch (error) {
     place.replaceChildren(h("p", {}, `Open ${location.href} on the phone. The code cannot be drawn: ${error instanceof Error ? error.message : error}`));
   }
@@ -315,5 +317,8 @@ async function listCaptures() {
     if (list.children.length === LISTED) break;
     list.append(h("li", {}, h("a", { href: `/?capture=${encodeURIComponent(capture.id)}` }, capture.name || "Without a name", h("span", {}, ago(capture.created_at)))));
   }
-  byId("captures").hidden = list.children.length === 0;
+  const none = list.children.length === 0;
+  byId("captures").hidden = none;
+  byId("example").hidden = !none || items.all.length > 0;
+  if (none) byId("example").replaceChildren(exampleOffer());
 }

@@ -18,8 +18,8 @@ function next() {
   return own ? address.pathname + address.search : at("/");
 }
 
-form.addEventListener("submit", async (event) => {
-  event.preventDefault();
+/** Exchange the key of the form for a session, and go to where the reader was. */
+async function signIn() {
   error.textContent = "";
   key.removeAttribute("aria-invalid");
   // A header holds ASCII only; a key that was copied with something else cannot be right.
@@ -35,10 +35,22 @@ form.addEventListener("submit", async (event) => {
     key.setAttribute("aria-invalid", "true");
     key.select();
   }
+}
+
+form.addEventListener("submit", (event) => {
+  event.preventDefault();
+  void signIn();
 });
 
+// A code that a phone has read carries a key after "#", which browsers send to no server. It does not stay in the address.
+const carried = new URLSearchParams(location.hash.slice(1)).get("key");
+if (carried) history.replaceState(null, "", location.pathname + location.search);
+
 const caller = await startShell({ open: true });
-if (caller) {
+if (carried && caller?.key_name !== "no key") {
+  key.value = carried;
+  await signIn();
+} else if (caller) {
   form.hidden = true;
   byId("already").hidden = false;
   byId("already-text").textContent = caller.key_name === "no key"
