@@ -4,6 +4,7 @@ The scan is simulated on the still life: true surfaces with the noise of a scann
 training gains from it.
 """
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -53,6 +54,15 @@ def test_points_of_a_scan_take_the_place_of_the_others(name: str, capture: Path,
     assert near.max() < 1e-3
     assert f"{name} holds {len(points):,} points." in scene.notes
     assert start_model_path(capture, tmp_path, TrainOptions(start=name)) is None
+
+
+def test_a_scan_beside_a_zip_of_photos_and_cameras(capture: Path, tmp_path: Path) -> None:
+    zipped = tmp_path / "zipped"
+    (zipped / "images").mkdir(parents=True)
+    (zipped / "poses").mkdir()
+    shutil.make_archive(str(zipped / "images" / "all"), "zip", capture)
+    write_las(zipped / "poses" / "scan.laz", *scanned())
+    assert load(zipped, tmp_path, "scan.laz").facts["loose_points_used"] > 1000
 
 
 @pytest.mark.parametrize("change", ["axes", "units"])

@@ -46,6 +46,7 @@ def posed_scene(
     Raises Refusal for poses and points that cannot be used and for a scale that cannot be followed, and SfmFailed.
     """
     capture = example.photographed_capture(capture, workdir, on_progress, cancelled)
+    points = given_points.points_path(capture, options)
     capture = zipped.data_set(capture, workdir, cancelled)
     try:
         given = posed.find(capture)
@@ -53,7 +54,6 @@ def posed_scene(
         raise Refusal(
             "poses_invalid", str(error), advice="Give one data set, or photos without cameras."
         ) from error
-    points = given_points.points_path(capture, options)
     if given is not None:
         if options.scale is not None:
             raise Refusal(
