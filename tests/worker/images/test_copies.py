@@ -13,10 +13,22 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from PIL import Image, ImageDraw, ImageEnhance
 
-from splatmill_worker.images.copies import SmallPicture, copies, small_grey
+from splatmill_worker.images.copies import (
+    ALIKE,
+    ALIKE_CROPPED,
+    EXACT,
+    GRID,
+    NEAREST,
+    ROWS,
+    SmallPicture,
+    _nearest,
+    copies,
+    small_grey,
+)
 from splatmill_worker.images.flow import sampled
 from splatmill_worker.images.prepare import prepare
 from splatmill_worker.synthetic import orbit, photograph, still_life
@@ -158,3 +170,49 @@ def test_copies_are_left_out_with_a_word_and_their_mask_is_kept(tmp_path: Path) 
         tmp_path / "masks" / "web" / "2.png"
     ]
     assert "6 photos show the same as another one" in result.warnings[-1]
+
+
+def grids(rng: np.random.Generator, count: int) -> npt.NDArray[np.float32]:
+    """Random pictures of which many are nearly or exactly alike, some of them turned."""
+    base = rng.normal(size=(max(1, count // 4), GRID, GRID))
+    chosen = base[rng.integers(len(base), size=count)]
+    noise = rng.choice([0.0, 0.2, 0.6], size=(count, 1, 1)) * rng.normal(size=chosen.shape)
+    turned = [np.rot90(each, turns) for each, turns in zip(chosen + noise, rng.integers(4, size=count), strict=True)]
+    result = np.stack(turned)
+    result -= result.mean(axis=(1, 2), keepdims=True)
+    result *= EXACT / np.linalg.norm(result, axis=(1, 2), keepdims=True)
+    return np.rint(result).astype(np.float32)
+
+
+def nearest_of_all_pairs(
+    pictures: npt.NDArray[np.float32], sizes: npt.NDArray[np.int64], stems: npt.NDArray[np.int64]
+) -> dict[int, list[tuple[int, int]]]:
+    """In whole numbers, with a sort in place of a search for the largest."""
+    count = len(pictures)
+    flat = pictures.reshape(count, -1).astype(np.int64)
+    cropped = (sizes[:, None] != sizes) | (stems[:, None] == stems)
+    ranked: dict[int, list[tuple[int, int, int]]] = {}
+    for turns in range(4):
+        similar = np.rot90(pictures, turns, axes=(1, 2)).reshape(count, -1).astype(np.int64) @ flat.T
+        least = np.where(cropped & (turns == 0), ALIKE_CROPPED, ALIKE) * EXACT**2
+        for first in range(count):
+            alike = [
+                (-int(similar[first, second]), second, turns)
+                for second in range(count)
+                if first != second and similar[first, second] >= least[first, second]
+            ]
+            if alike:
+                ranked.setdefault(first, []).extend(sorted(alike)[:NEAREST])
+    return {first: [(second, turns) for _, second, turns in sorted(each)] for first, each in ranked.items()}
+
+
+@pytest.mark.parametrize(
+    ("count", "kinds"), [(2, 1), (3, 1), (150, 1), (150, 3), (ROWS + 1, 1)], ids=str
+)
+def test_likely_copies_in_blocks_are_those_of_all_pairs(count: int, kinds: int) -> None:
+    rng = np.random.default_rng(count + kinds)
+    pictures, sizes = grids(rng, count), rng.integers(kinds, size=count)
+    stems = np.arange(count) if kinds == 1 else rng.integers(count // 2, size=count)
+    expected = nearest_of_all_pairs(pictures, sizes, stems)
+    assert _nearest(pictures, sizes, stems) == expected
+    assert count < 100 or len(expected) > count // 2

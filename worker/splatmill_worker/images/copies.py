@@ -7,7 +7,7 @@ copy shows agrees everywhere after that: a turntable's still background alone do
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import PurePosixPath
@@ -76,8 +76,16 @@ LEVELS = (4, 2, 1)
 ROUNDS = 8
 """Rounds of Gauss-Newton on each of these."""
 
+EXACT = 4000
+"""Norm to which these pictures are scaled before they are rounded. Sums of their products stay below 2^24, which float32
+adds without error, so that photos rank alike in whatever order a machine adds."""
+
+ROWS = 256
+"""Photos that are compared with all others at a time: all pairs of 10,000 would take 400 MB."""
+
 Grey = npt.NDArray[np.float32]
 Bytes = npt.NDArray[np.uint8]
+Kinds = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -273,24 +281,50 @@ def _likely(pictures: Sequence[SmallPicture]) -> dict[int, list[tuple[int, int]]
         ]
     )
     grids -= grids.mean(axis=(1, 2), keepdims=True)
-    grids /= np.linalg.norm(grids, axis=(1, 2), keepdims=True) + 1e-6
-    flat = grids.reshape(len(grids), -1)
-    sizes = np.array([(each.width, each.height) for each in pictures])
-    stems = np.unique([_stem(each.name) for each in pictures], return_inverse=True)[1]
+    grids *= EXACT / (np.linalg.norm(grids, axis=(1, 2), keepdims=True) + 1e-6)
+    sizes = _kinds([(each.width, each.height) for each in pictures])
+    stems = _kinds([_stem(each.name) for each in pictures])
+    return _nearest(np.rint(grids), sizes, stems)
+
+
+def _nearest(grids: Grey, sizes: Kinds, stems: Kinds) -> dict[int, list[tuple[int, int]]]:
+    """`_likely` for pictures of one size, of which photos of one size and those of one name have equal numbers.
+
+    grids: whole numbers [n,GRID,GRID], each of mean 0 and norm EXACT, up to rounding.
+    """
+    count = len(grids)
+    flat = grids.reshape(count, -1)
+    # Most captures have photos of one size and no two of one name: then one limit holds for all pairs.
+    mixed = len(np.unique(sizes)) > 1 or len(np.unique(stems)) < count
     found: dict[int, list[tuple[float, int, int]]] = {}
     for turns in range(4):
         turned = np.rot90(grids, turns, axes=(1, 2)).reshape(flat.shape)
-        for index, row in enumerate(turned):  # a row at a time: all pairs of 10,000 photos would take 400 MB
-            similar = flat @ row
-            similar[index] = -1.0
-            least = np.full(len(similar), ALIKE)
-            if turns == 0:
-                least[(sizes != sizes[index]).any(axis=1) | (stems == stems[index])] = ALIKE_CROPPED
-            similar[similar < least] = -1.0
-            for partner in np.argsort(-similar, kind="stable")[:NEAREST]:
-                if similar[partner] > 0.0:
-                    found.setdefault(index, []).append((-float(similar[partner]), int(partner), turns))
+        for start in range(0, count, ROWS):
+            rows = np.arange(start, min(start + ROWS, count))
+            similar = (turned[rows] @ flat.T) / np.float32(EXACT**2)
+            similar[np.arange(len(rows)), rows] = -1.0
+            least = ALIKE
+            if turns == 0 and mixed:
+                least = ALIKE_CROPPED
+                strict = (sizes[rows, None] == sizes) & (stems[rows, None] != stems)
+                similar[strict & (similar < ALIKE)] = -1.0
+            for _ in range(min(NEAREST, count - 1)):
+                # Of equal ones, argmax returns the first.
+                partner = similar.argmax(axis=1)
+                best = similar[np.arange(len(rows)), partner]
+                alike = np.flatnonzero(best >= least)
+                if not len(alike):
+                    break
+                for at in alike:
+                    found.setdefault(int(rows[at]), []).append((-float(best[at]), int(partner[at]), turns))
+                similar[np.arange(len(rows)), partner] = -1.0
     return {index: [(partner, turns) for _, partner, turns in sorted(each)] for index, each in found.items()}
+
+
+def _kinds(values: Sequence[Hashable]) -> Kinds:
+    """A number for each value, equal for equal ones."""
+    numbers: dict[Hashable, int] = {}
+    return np.array([numbers.setdefault(value, len(numbers)) for value in values])
 
 
 def _stem(name: str) -> str:
