@@ -177,7 +177,9 @@ def grids(rng: np.random.Generator, count: int) -> npt.NDArray[np.float32]:
     base = rng.normal(size=(max(1, count // 4), GRID, GRID))
     chosen = base[rng.integers(len(base), size=count)]
     noise = rng.choice([0.0, 0.2, 0.6], size=(count, 1, 1)) * rng.normal(size=chosen.shape)
-    turned = [np.rot90(each, turns) for each, turns in zip(chosen + noise, rng.integers(4, size=count), strict=True)]
+    turned = [
+        np.rot90(each, turns) for each, turns in zip(chosen + noise, rng.integers(4, size=count), strict=True)
+    ]
     result = np.stack(turned)
     result -= result.mean(axis=(1, 2), keepdims=True)
     result *= EXACT / np.linalg.norm(result, axis=(1, 2), keepdims=True)
@@ -206,9 +208,7 @@ def nearest_of_all_pairs(
     return {first: [(second, turns) for _, second, turns in sorted(each)] for first, each in ranked.items()}
 
 
-@pytest.mark.parametrize(
-    ("count", "kinds"), [(2, 1), (3, 1), (150, 1), (150, 3), (ROWS + 1, 1)], ids=str
-)
+@pytest.mark.parametrize(("count", "kinds"), [(2, 1), (3, 1), (150, 1), (150, 3), (ROWS + 1, 1)], ids=str)
 def test_likely_copies_in_blocks_are_those_of_all_pairs(count: int, kinds: int) -> None:
     rng = np.random.default_rng(count + kinds)
     pictures, sizes = grids(rng, count), rng.integers(kinds, size=count)

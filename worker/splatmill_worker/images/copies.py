@@ -77,8 +77,8 @@ ROUNDS = 8
 """Rounds of Gauss-Newton on each of these."""
 
 EXACT = 4000
-"""Norm to which these pictures are scaled before they are rounded. Sums of their products stay below 2^24, which float32
-adds without error, so that photos rank alike in whatever order a machine adds."""
+"""Norm to which these pictures are scaled before they are rounded. Sums of their products stay below 2^24, which
+float32 adds without error, so that photos rank alike in whatever order a machine adds."""
 
 ROWS = 256
 """Photos that are compared with all others at a time: all pairs of 10,000 would take 400 MB."""

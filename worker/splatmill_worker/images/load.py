@@ -16,7 +16,7 @@ import numpy.typing as npt
 import torch
 from PIL import Image
 
-from splatmill_worker.images import lens as lenses
+from splatmill_worker.images import look_ups
 from splatmill_worker.images.decode import Pixels
 from splatmill_worker.images.decoding.decoders import decode
 from splatmill_worker.images.masks import shown_part
@@ -76,15 +76,18 @@ def load_views(
     """
     sizes = [training_size(view.camera.width, view.camera.height, longest_side) for view in views]
     block = _Block(sizes) if files is None else _Filed(files)
-    with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
-        return list(
-            pool.map(
-                lambda index: block.moved(
-                    index, load_view(views[index], longest_side, background=background)
-                ),
-                range(len(views)),
+    try:
+        with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
+            return list(
+                pool.map(
+                    lambda index: block.moved(
+                        index, load_view(views[index], longest_side, background=background)
+                    ),
+                    range(len(views)),
+                )
             )
-        )
+    finally:
+        look_ups.forget()
 
 
 class _Filed:
@@ -230,7 +233,7 @@ def _undistort(
         planes = _area(planes, MAX_SAMPLES * width, MAX_SAMPLES * height)
     samples = max(1, min(MAX_SAMPLES, int(np.ceil(planes.shape[2] / width - 1e-6))))
     pinhole = camera.scaled_to(width, height)
-    grid, seen = _look_up(lens, (pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy), width, height, samples)
+    grid, seen = look_ups.of(lens, (pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy), width, height, samples)
     taken = torch.nn.functional.grid_sample(
         planes[None],
         grid[None],
@@ -240,29 +243,6 @@ def _undistort(
         align_corners=False,
     )
     return torch.nn.functional.avg_pool2d(taken, samples)[0].clamp(0.0, 255.0), seen
-
-
-@lru_cache(maxsize=64)
-def _look_up(
-    lens: Lens, intrinsics: tuple[float, float, float, float], width: int, height: int, samples: int
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Where `samples` x `samples` positions in each pixel of a pinhole camera lie on the photo.
-
-    intrinsics: fx, fy, cx, cy of the camera in pixels.
-
-    Returns the positions [samples * height, samples * width, 2] in the range of grid_sample, -1 to 1, and the pixels
-    [height, width] of which the photo covers every position.
-    """
-    x, y = Camera(width, height, *intrinsics, np.eye(4)).normalized(
-        (np.arange(width * samples) + 0.5) / samples, (np.arange(height * samples) + 0.5) / samples
-    )
-    rays = np.stack(np.meshgrid(x, y, indexing="xy"), axis=-1).reshape(-1, 2)
-    pixels = lenses.distort(lens, rays)
-    grid = pixels / (lens.width, lens.height) * 2.0 - 1.0
-    shape = height * samples, width * samples
-    inside = np.all(np.abs(grid) <= 1.0 + 1.0 / min(lens.width, lens.height), axis=1).reshape(shape)
-    seen = inside.reshape(height, samples, width, samples).all(axis=(1, 3))
-    return torch.from_numpy(grid.reshape(*shape, 2)).float(), torch.from_numpy(seen)
 
 
 def _bytes(values: torch.Tensor) -> Pixels:
