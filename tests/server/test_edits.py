@@ -53,6 +53,8 @@ def app(serve: Serve, folder: Path) -> ServedApp:
 def test_a_part_of_a_model_becomes_a_new_one(app: ServedApp, folder: Path, tmp_path: Path) -> None:
     hold_out(app, MODEL, VIEWS)
     app.service.storage.put(layout.model_file(MODEL, "frame.json"), b'{"unit": "metre"}')
+    of_the_whole = json.dumps({"result": {"psnr": 9.0, "lpips_vgg": 0.1, "mse": 0.2, "steps": 30}})
+    app.service.storage.put(layout.model_file(MODEL, "report.json"), of_the_whole.encode())
     right = int((ply.read(folder / "model.ply").gaussians.means[:, 0] >= 0).sum())
     with Client(str(app.http.base_url)) as client:
         model = client.model(MODEL)
@@ -71,6 +73,13 @@ def test_a_part_of_a_model_becomes_a_new_one(app: ServedApp, folder: Path, tmp_p
         assert json.loads(half.download(tmp_path / "frame.json", file="frame.json").read_text()) == {
             "unit": "metre"
         }
+        result = json.loads(half.download(tmp_path / "report.json", file="report.json").read_text())["result"]
+        assert (result["psnr"], result["lpips_vgg"], result["mse"], result["steps"]) == (
+            made.psnr,
+            None,
+            None,
+            30,
+        )
         assert client.model(MODEL).model.gaussians == 400
         for wrong in ({}, {"box": {"min": [0, 0, 0], "max": [0, 1, 1]}}, {"min_opacity": 2.0}):
             with pytest.raises(InvalidRequest):

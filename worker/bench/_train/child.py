@@ -6,7 +6,6 @@ import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 
 from _rows import Row
@@ -28,8 +27,8 @@ def prepared(scene: Scene, work: Path) -> Row:
     return _ask({"do": "prepare", **located(scene, work), "options": scene.options})
 
 
-def measured(run: BenchRun, work: Path, lpips: Sequence[Path] = ()) -> Row:
-    """The row of a run, or of its named failure; `lpips` are the files of weights of `Lpips`. Raises Fault."""
+def measured(run: BenchRun, work: Path) -> Row:
+    """The row of a run, or of its named failure. Raises Fault."""
     return _ask(
         {
             "do": "measure",
@@ -38,7 +37,6 @@ def measured(run: BenchRun, work: Path, lpips: Sequence[Path] = ()) -> Row:
             ),
             "identity": run.identity(),
             "budget": run.budget.options,
-            "lpips": [str(path) for path in lpips],
         }
     )
 

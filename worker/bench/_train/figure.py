@@ -29,18 +29,18 @@ def draw(rows: list[Row], references: list[Row], path: Path) -> None:
         if mine:
             lost = sum(failed(row) for row in timed if row["scene"] == scene)
             label = scene + (f" ({lost} failed)" if lost else "")
-            _line(quality, mine, "psnr", _color(scene), label)
-            _line(structure, mine, "ssim", _color(scene), label)
+            course(quality, mine, "psnr", _color(scene), label)
+            course(structure, mine, "ssim", _color(scene), label)
     _points(quality, structure, rows, references)
     for panel in (quality, structure):
         panel.set(xscale="log", xlabel="training seconds (cameras, loading and evaluation are not in them)")
-        _decades(panel.xaxis, (1.0, 3.0))
+        decades(panel.xaxis, (1.0, 3.0))
     quality.set(ylabel="held-out PSNR, dB")
     structure.set(yscale="log", ylabel="held-out 1 - SSIM")
-    _decades(structure.yaxis)
+    decades(structure.yaxis)
     error = quality.secondary_yaxis("right", functions=(_mse, _psnr))
     error.set_ylabel("mean squared error that this PSNR stands for")
-    _decades(error.yaxis)
+    decades(error.yaxis)
     if quality.has_data():
         handles, labels = quality.get_legend_handles_labels()
         scenes_first = sorted(range(len(labels)), key=lambda i: "," in labels[i])
@@ -57,7 +57,8 @@ def draw(rows: list[Row], references: list[Row], path: Path) -> None:
     _plot.save(figure, path, footer(timed or rows))
 
 
-def _line(panel: Axes, rows: list[Row], what: str, color: str, label: str) -> None:
+def course(panel: Axes, rows: list[Row], what: str, color: str, label: str) -> None:
+    """Plot `what`, psnr or ssim, over the budgets of `rows`, and thinly over the seconds of the longest run."""
     by_budget: dict[str, list[Row]] = {}
     for row in rows:
         by_budget.setdefault(row["budget"], []).append(row)
@@ -73,10 +74,10 @@ def _line(panel: Axes, rows: list[Row], what: str, color: str, label: str) -> No
     above = [value.largest - value.median for _, value in places]
     panel.errorbar(x, y, yerr=[below, above], fmt="o-", color=color, lw=1.8, ms=5, capsize=3, label=label)
     longest = max(rows, key=lambda row: row["seconds"]["train"])
-    course = [point for point in longest["curve"] if point["psnr"] is not None and point["seconds"] > 0]
+    points = [point for point in longest["curve"] if point["psnr"] is not None and point["seconds"] > 0]
     panel.plot(
-        [point["seconds"] for point in course],
-        [_value(point, what) for point in course],
+        [point["seconds"] for point in points],
+        [_value(point, what) for point in points],
         color=color,
         lw=0.7,
         alpha=0.7,
@@ -127,7 +128,7 @@ def _points(quality: Axes, structure: Axes, rows: list[Row], references: list[Ro
             )
 
 
-def _decades(axis: Axis, at: tuple[float, ...] = (1.0, 2.0, 5.0)) -> None:
+def decades(axis: Axis, at: tuple[float, ...] = (1.0, 2.0, 5.0)) -> None:
     """Set ticks at the same positions of every decade, labelled with plain numbers."""
     axis.set_major_locator(LogLocator(subs=at))
     axis.set_major_formatter(FormatStrFormatter("%g"))

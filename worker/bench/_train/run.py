@@ -18,7 +18,6 @@ from torch import Tensor
 
 from _train import bare, few, instead
 from _train.configurations import revised
-from _train.lpips import Lpips
 from _train.outliers import judged
 from _train.perceived import perceived
 from _train.rows import code_version
@@ -33,9 +32,11 @@ from splatmill_worker.pipeline.holdout import split_views
 from splatmill_worker.pipeline.job import choose_kernels
 from splatmill_worker.scene import Normalization, Scene
 from splatmill_worker.sfm import posed
+from splatmill_worker.splat import lpips_weights
 from splatmill_worker.splat.evaluate import Renderer, benchmark_background, evaluate
 from splatmill_worker.splat.formats import ply
 from splatmill_worker.splat.gaussians import Gaussians
+from splatmill_worker.splat.lpips import Distances
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.render import render
 from splatmill_worker.splat.report.report import plain
@@ -49,6 +50,8 @@ RESULT = (
     "psnr_color_fitted",
     "ssim",
     "mse",
+    "lpips_vgg",
+    "lpips_alex",
     "train_psnr",
     "steps",
     "gaussians",
@@ -145,7 +148,8 @@ def judge(job: Row) -> Row:
     moved = gaussians.moved(frame.scale, torch.from_numpy(frame.translation))
     draw = _drawing(moved, options)
     with torch.no_grad():
-        score = evaluate(draw, views, benchmark_background(views))
+        distances = None if lpips_weights.absence() else Distances.read()
+        score = evaluate(draw, views, benchmark_background(views), distances)
     judged: Row = rounded(
         {
             "kind": "peer",
@@ -156,6 +160,8 @@ def judge(job: Row) -> Row:
             "psnr": score.psnr,
             "ssim": score.ssim,
             "mse": score.mse,
+            "lpips_vgg": score.lpips_vgg,
+            "lpips_alex": score.lpips_alex,
             **perceived(draw, views, benchmark_background(views)),
             "gaussians": gaussians.count,
             "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
@@ -179,8 +185,7 @@ def _perceived(job: Row, options: TrainOptions, gaussians: Gaussians) -> Row:
     if options.image_size is None:
         return {}
     _, views = held_out(job, options, options.image_size)
-    distance = Lpips(*map(Path, job["lpips"])) if job.get("lpips") else None
-    return perceived(_drawing(gaussians, options), views, benchmark_background(views), distance)
+    return perceived(_drawing(gaussians, options), views, benchmark_background(views))
 
 
 def _drawing(gaussians: Gaussians, options: TrainOptions) -> Renderer:

@@ -32,6 +32,9 @@ class Scene:
 KNOWN = ("fox", "lego", "lund", "kermit", "synthetic", "beer", "snowmiku")
 """Trained by default. fox and lego bring their cameras; the others' are recovered once, then kept."""
 
+OFFICIAL = "lego-800"
+"""lego at its published size, for `bench train --official`."""
+
 FOLDED = "beer-folded"
 """beer with the cameras that came with it, which lay two sides of the room on each other (decisions: unfold)."""
 
@@ -47,7 +50,7 @@ with darker corners, and with local tone mapping. And with things that stand in 
 MADE: dict[str, dict[str, Any]] = {"synthetic": {}, **PLANTED}
 """What is planted in the photos of each built-in scene: arguments of `synthetic.capture`."""
 
-COMPARED = (*PLANTED, *bare.SCENES, *few.SCENES, FOLDED)
+COMPARED = (*PLANTED, *bare.SCENES, *few.SCENES, FOLDED, OFFICIAL)
 """Made for one comparison each; how soon they are learnt says nothing beside the captures that they are made of."""
 
 ALL = (*KNOWN, *COMPARED)
@@ -70,7 +73,7 @@ def named(text: str, work: Path) -> Scene:
         whole = named(few.SCENES[text][0], work)
         options = {**whole.options, "test_views": few.held_out(text)}
         return Scene(text, work / text / "capture", options, posed=True, made=text)
-    if text in (*KNOWN, FOLDED):
+    if text in (*KNOWN, FOLDED, OFFICIAL):
         shared = FOLDERS["beer" if text == FOLDED else text]
         folder = SHARED / shared
         if not folder.is_dir():
@@ -79,8 +82,8 @@ def named(text: str, work: Path) -> Scene:
             )
         if text == "beer":
             return Scene(text, _photos_alone(folder, work / text / "capture"))
-        if text == "lego":
-            lego = {"image_size": 400, "holdout": 8}
+        if text in ("lego", OFFICIAL):
+            lego = {"image_size": 800 if text == OFFICIAL else 400, "holdout": 8}
             return Scene(text, folder, lego, transparent=True, points=False, posed=True)
         return Scene(text, folder, posed=text in (FOLDED, "fox"))
     folder = Path(text)

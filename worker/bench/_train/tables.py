@@ -19,8 +19,11 @@ TOLERANCE = 0.05
 
 COMMAND = "splatmill bench train"
 
-SEEN = ("ms_ssim", "flip")
-"""Errors as people see them. LPIPS is shown beside them where a row has it."""
+SEEN = {"ms_ssim": "MS-SSIM", "flip": "FLIP"}
+"""Errors as people see them, with their heads."""
+
+LPIPS = {"lpips_vgg": "LPIPS, VGG-16", "lpips_alex": "LPIPS, AlexNet"}
+"""Others, which are shown where a row has them."""
 
 RULES = """Seconds are training seconds: cameras, loading and evaluation are clocked apart. Held-out views are the
 data set's own, else every 8th photo by name. Medians over seeds, least and largest in brackets. Every row is a run of
@@ -54,8 +57,10 @@ def document(rows: list[Row], references: list[Row], rows_at: Path, here: Path, 
 def budgets(timed: list[Row]) -> str:
     """A table of the result of each time budget, and whether runs ended in time and never got worse with more time."""
     groups = grouped((row for row in whole(timed) if by_time(row)), "scene", "budget")
-    seen = [*SEEN, *(["lpips"] if any(row.get("lpips") is not None for row in timed) else [])]
-    quality_of = "|".join(["PSNR dB|SSIM", *(name.upper().replace("_", "-") for name in seen)])
+    seen = SEEN | {
+        name: head for name, head in LPIPS.items() if any(row.get(name) is not None for row in timed)
+    }
+    quality_of = "|".join(["PSNR dB|SSIM", *seen.values()])
     head = (
         f"scene|budget|seeds|training s|{quality_of}|Gaussians|steps|all wall s|all CPU s|peak MB|cameras s"
     )

@@ -13,6 +13,7 @@ from splatmill_worker.errors import Refusal
 from splatmill_worker.kernels.gpu.device import absence
 from splatmill_worker.pipeline.events import Emit
 from splatmill_worker.pipeline.live import Looks
+from splatmill_worker.splat.lpips import Distances
 from splatmill_worker.splat.plan.plan import Kernels
 
 
@@ -56,6 +57,20 @@ class Job:
         """Say why training runs on the CPU of a machine that has a GPU, where no option asks for the CPU."""
         if self.kernels == "cpu" and self.options.backend is Backend.auto and torch.cuda.is_available():
             self.warn(f"{absence()} Training runs on the CPU.")
+
+
+def check_lpips(options: TrainOptions) -> None:
+    """Raise Refusal where `lpips` asks for what this machine cannot measure, before hours are spent."""
+    if options.lpips is not Switch.on:
+        return
+    try:
+        Distances.read()
+    except ValueError as error:
+        raise Refusal(
+            "option_out_of_range",
+            f"The option lpips asks for LPIPS. {error}",
+            advice="Or set lpips to auto, which leaves it out.",
+        ) from error
 
 
 def choose_kernels(options: TrainOptions) -> Kernels:

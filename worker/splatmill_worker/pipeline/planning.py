@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+from splatmill.schema import Switch
 from splatmill_worker.errors import Refusal
 from splatmill_worker.kernels.gpu.device import describe
 from splatmill_worker.pipeline.cameras import Cameras
@@ -13,6 +14,7 @@ from splatmill_worker.pipeline.first_gaussians import First, first_gaussians
 from splatmill_worker.pipeline.job import Job
 from splatmill_worker.pipeline.photos import Photos, Room, load_photos
 from splatmill_worker.pipeline.stage_times import Stages
+from splatmill_worker.splat import lpips_weights
 from splatmill_worker.splat.engine.open import open_engine
 from splatmill_worker.splat.plan.capacity import resolved
 from splatmill_worker.splat.plan.decide import decide
@@ -87,6 +89,8 @@ def _measure_facts(job: Job, cameras: Cameras, photos: Photos, first: First) -> 
         facts = replace(facts, hull_points=len(first.hull.points))
     elif first.hull is not None:
         facts = replace(facts, no_hull=first.hull.reason)
+    if job.options.lpips is not Switch.off:
+        facts = replace(facts, no_lpips=lpips_weights.absence())
     card = describe() if job.kernels == "gpu" else None
     return facts if card is None else replace(facts, memory_available=card.free_bytes)
 

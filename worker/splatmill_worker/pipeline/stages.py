@@ -12,7 +12,7 @@ from splatmill_worker.pipeline.cameras import recover_cameras
 from splatmill_worker.pipeline.events import Emit
 from splatmill_worker.pipeline.files import write_files
 from splatmill_worker.pipeline.first_gaussians import seeded
-from splatmill_worker.pipeline.job import Job, choose_kernels
+from splatmill_worker.pipeline.job import Job, check_lpips, choose_kernels
 from splatmill_worker.pipeline.live import Looks, Onlookers
 from splatmill_worker.pipeline.planning import Revise, plan_training, planned_photos
 from splatmill_worker.pipeline.stage_times import Stages
@@ -61,6 +61,7 @@ def run(
     try:
         looks = None if onlookers is None else Looks(onlookers)
         job = Job(capture, workdir, options, choose_kernels(options), emit, cancelled, looks)
+        check_lpips(options)
         job.out.mkdir(parents=True, exist_ok=True)
         job.warn_of_idle_gpu()
         emit(StateEvent(state=JobState.sfm))

@@ -1,10 +1,10 @@
-"""How close rendered views are to photos: PSNR, PSNR after a fit of the colours, and SSIM."""
+"""How close rendered views are to photos: PSNR, PSNR after a fit of the colours, SSIM and, where asked for, LPIPS."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from splatmill_worker.kernels import ops
 from splatmill_worker.splat.color_fit import color_fitted
+from splatmill_worker.splat.lpips import LEAST_SIDE, Distances
 
 if TYPE_CHECKING:  # the renderer compares pictures without what reads photos
     from splatmill_worker.splat.views import Target, TrainingView
@@ -30,6 +31,7 @@ class ViewScore:
     ssim: structural similarity (Wang et al. 2004), 1 for identical images.
     psnr_color_fitted: dB, after the affine map of the rendered colours that fits the photo best. How far it lies above
         `psnr` is what exposure and white balance cost; it uses the photo, and is no score to compare methods by.
+    lpips_vgg, lpips_alex: LPIPS by VGG-16 and by AlexNet, 0 for identical images; None where it was not computed.
     """
 
     name: str
@@ -37,6 +39,8 @@ class ViewScore:
     psnr: float
     ssim: float
     psnr_color_fitted: float
+    lpips_vgg: float | None = None
+    lpips_alex: float | None = None
 
 
 @dataclass(frozen=True)
@@ -65,13 +69,39 @@ class Score:
         """Mean over the views, of colours in 0 to 1."""
         return sum(view.mse for view in self.views) / len(self.views)
 
+    @property
+    def lpips_vgg(self) -> float | None:
+        """Mean over the views; None where one has none."""
+        return _mean([view.lpips_vgg for view in self.views])
 
-def evaluate(render: Renderer, views: Sequence[TrainingView], background: Tensor) -> Score:
-    """Score of every view at full training resolution, over the RGB `background` [3] where photos are transparent."""
+    @property
+    def lpips_alex(self) -> float | None:
+        """Mean over the views; None where one has none."""
+        return _mean([view.lpips_alex for view in self.views])
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if len(known) == len(values) else None
+
+
+def evaluate(
+    render: Renderer, views: Sequence[TrainingView], background: Tensor, distances: Distances | None = None
+) -> Score:
+    """Score of every view at full training resolution, over the RGB `background` [3] where photos are transparent.
+
+    distances: LPIPS is computed with them, but not of photos with a mask or with a side below LEAST_SIDE.
+    """
     scores = []
     for view in views:
         target = view.full
-        scores.append(compare(view.name, render(target, background), target.over(background), target.mask))
+        shown, photo = render(target, background), target.over(background)
+        score = compare(view.name, shown, photo, target.mask)
+        if distances is not None and target.mask is None and min(photo.shape[:2]) >= LEAST_SIDE:
+            pictures = shown.detach().float().clamp(0.0, 1.0), photo.to(shown.device).float() / 255.0
+            vgg, alex = (distance(*pictures) for distance in distances)
+            score = replace(score, lpips_vgg=vgg, lpips_alex=alex)
+        scores.append(score)
     return Score(tuple(scores))
 
 

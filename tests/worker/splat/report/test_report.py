@@ -87,6 +87,19 @@ def test_a_photo_far_below_the_others_is_named_with_advice(tmp_path: Path) -> No
     assert page.index("said before.") < page.index(misfit["why"])
 
 
+def test_lpips_is_on_the_page_where_it_was_measured(tmp_path: Path) -> None:
+    result = trained([30.0, 31.0], held_out=True)
+    assert "LPIPS" not in (report_of(tmp_path, result) and (tmp_path / "report.html").read_text())
+    view = replace(result.on_training.views[0], lpips_vgg=0.1234, lpips_alex=0.0567)
+    report = report_of(tmp_path, replace(result, held_out=Score((view,))))
+    assert (report["result"]["lpips_vgg"], report["result"]["lpips_alex"]) == (0.1234, 0.0567)
+    assert [row["lpips_vgg"] for row in report["views"]] == [0.1234, None, None]
+    page = (tmp_path / "report.html").read_text()
+    assert "SSIM 0.900, LPIPS 0.123 by VGG-16 and 0.057 by AlexNet" in page
+    assert "<th class=n>LPIPS, VGG-16</th>" in page
+    assert "<td class=n>0.1234</td><td class=n>0.0567</td>" in page
+
+
 def test_photos_without_a_camera_are_counted_and_named(tmp_path: Path) -> None:
     missing = tuple((f"x{i}.png", "It shares too little.") for i in range(7))
     report = report_of(tmp_path, trained([30.0], held_out=True), missing)

@@ -25,6 +25,7 @@ from splatmill_worker.splat.plan.plan import Kernels, Plan
 from splatmill_worker.splat.plan.rates import PAPER_STEPS, Annealing, beta2_of, boost_of
 from splatmill_worker.splat.plan.reasons import Decision, Explanation, by_option
 from splatmill_worker.splat.plan.schedule import MANY_VISITS, Schedule
+from splatmill_worker.splat.plan.scores import decide_lpips
 from splatmill_worker.splat.start.frusta import RANDOM_GAUSSIANS
 from splatmill_worker.splat.start.hull import at_first
 from splatmill_worker.splat.start.points import ENOUGH_POINTS
@@ -71,6 +72,7 @@ def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
         "undistortion": undistortion(facts),
         "masks": Decision(facts.masked > 0, "" if facts.masked else "No photo has masked pixels."),
         "validation": (validation := decide_validation(facts, options, steps)),
+        "lpips": (lpips := decide_lpips(facts, options)),
         "background": (background := decide_background(facts, options)),
         "alpha": _alpha(facts, options),
         "exposure": (exposure := decide_exposure(facts, options)),
@@ -112,6 +114,7 @@ def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
         cluster_culling=culling.value,
         validation=validation.value,
         least_gain=gain or 0.0,
+        lpips=lpips.value,
         reasons=explanation.chosen,
         left_out=explanation.left_out,
         forced=explanation.forced,

@@ -114,6 +114,7 @@ class Facts:
     no_points: why a posed scene has no points, a sentence; None where it has some.
     photo_bytes: size of all loaded photos, held-out ones included, with a mask or alpha for each; None: not known.
     photos_on_disk: whether they were loaded into files, since that is more than photos may take of the memory.
+    no_lpips: why LPIPS cannot be measured here, a sentence; None where it can.
     """
 
     views: int
@@ -141,6 +142,7 @@ class Facts:
     no_hull: str | None = None
     photo_bytes: int | None = None
     photos_on_disk: bool = False
+    no_lpips: str | None = None
 
     @property
     def pixels(self) -> int:

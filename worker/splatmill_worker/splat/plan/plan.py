@@ -43,6 +43,7 @@ class Plan:
     cluster_culling: steps leave out clusters of Gaussians that the photo does not show.
     validation: number of training photos that are set aside for `target_psnr` and `stops_when_flat`; None: neither.
     least_gain: dB, for `stops_when_flat`; 0 where training ends only once it over-fits.
+    lpips: LPIPS of the held-out photos is measured at the end.
     reasons: a sentence for each field of the plan.
     left_out: a sentence for each thing that this scene does not need.
     forced: names of what an option fixed.
@@ -67,6 +68,7 @@ class Plan:
     cluster_culling: bool = False
     validation: int | None = None
     least_gain: float = 0.02
+    lpips: bool = False
     reasons: dict[str, str] = field(default_factory=dict)
     left_out: dict[str, str] = field(default_factory=dict)
     forced: tuple[str, ...] = ()

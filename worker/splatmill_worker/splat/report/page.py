@@ -34,6 +34,15 @@ COLOR_FITTED = (
 )
 
 
+SCORES = (
+    ("psnr", "PSNR (dB)", ".2f"),
+    ("psnr_color_fitted", "PSNR, colours fitted (dB)", ".2f"),
+    ("ssim", "SSIM", ".4f"),
+    ("lpips_vgg", "LPIPS, VGG-16", ".4f"),
+    ("lpips_alex", "LPIPS, AlexNet", ".4f"),
+)
+"""Scores of a view in report.json, with their heads on the page and their format."""
+
 OPEN_VERSIONS = ("splatmill", "backend", "instruction_set")
 """Versions of report.json that the page shows, too: it is given out by links to the model."""
 
@@ -107,21 +116,25 @@ def render(
         *_disagreeing(disagreeing),
         *(["<h2>What never moves, and is masked</h2>", *_marked(hidden)] if hidden else []),
         "<h2>All evaluated views</h2>",
-        _table(
-            ["photo", "split", "PSNR (dB)", "PSNR, colours fitted (dB)", "SSIM"],
-            [
-                [
-                    *(row["name"], row["split"]),
-                    *(f"{row['psnr']:.2f}", f"{row['psnr_color_fitted']:.2f}", f"{row['ssim']:.4f}"),
-                ]
-                for row in report["views"]
-            ],
-            2,
-        ),
+        _views(report["views"]),
         f"<p class=dim>{COLOR_FITTED}</p>",
         f"<p class=dim>{html.escape(_footer(report))}</p></html>",
     ]
     return "\n".join(parts)
+
+
+def _views(rows: Sequence[dict[str, Any]]) -> str:
+    """A table of the evaluated views, with the scores that any of them has."""
+    shown = [each for each in SCORES if any(row[each[0]] is not None for row in rows)]
+    lines = [
+        [
+            row["name"],
+            row["split"],
+            *("" if row[name] is None else f"{row[name]:{form}}" for name, _, form in shown),
+        ]
+        for row in rows
+    ]
+    return _table(["photo", "split", *(head for _, head, _ in shown)], lines, 2)
 
 
 def _disagreeing(found: Disagreeing) -> list[str]:
@@ -150,7 +163,10 @@ def _headline(result: dict[str, Any]) -> str:
     if result["psnr"] is None:
         return f"{result['train_psnr']:.2f} dB on training photos, none were held out; {counted}"
     fitted = f"{result['psnr_color_fitted']:.2f} dB with colours fitted"
-    return f"{result['psnr']:.2f} dB on held-out photos ({fitted}, SSIM {result['ssim']:.3f}); {counted}"
+    others = [fitted, f"SSIM {result['ssim']:.3f}"]
+    if result["lpips_vgg"] is not None:
+        others.append(f"LPIPS {result['lpips_vgg']:.3f} by VGG-16 and {result['lpips_alex']:.3f} by AlexNet")
+    return f"{result['psnr']:.2f} dB on held-out photos ({', '.join(others)}); {counted}"
 
 
 def _plan(plan: dict[str, Any]) -> str:

@@ -44,8 +44,6 @@ ADVICE: dict[Reason | None, str] = {
 WORST = 4
 """Views shown beside their photos."""
 
-NO_LPIPS = "LPIPS needs the weights of an image network, which are not part of Splatmill. PSNR and SSIM are reported."
-
 
 @dataclass(frozen=True)
 class PlannedScene:
@@ -115,7 +113,6 @@ def write_report(
                     {"what": f"the held-out photo {name} beside the model", "why": reason}
                     for name, reason in exported.left_out
                 ),
-                {"what": "lpips", "why": NO_LPIPS},
             ],
             "misfits": _misfits(trained),
             "warnings": warnings,
@@ -208,6 +205,8 @@ def _result(trained: Trained, written: int) -> dict[str, Any]:
         "psnr_color_fitted": None if held is None else held.psnr_color_fitted,
         "ssim": None if held is None else held.ssim,
         "mse": None if held is None else held.mse,
+        "lpips_vgg": None if held is None else held.lpips_vgg,
+        "lpips_alex": None if held is None else held.lpips_alex,
         "train_psnr": trained.on_training.psnr,
         "train_psnr_color_fitted": trained.on_training.psnr_color_fitted,
         "train_ssim": trained.on_training.ssim,

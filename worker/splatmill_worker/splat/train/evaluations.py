@@ -9,6 +9,7 @@ from typing import NamedTuple, TypeVar
 
 from splatmill_worker.splat.engine.protocol import Engine
 from splatmill_worker.splat.evaluate import Score, evaluate
+from splatmill_worker.splat.lpips import Distances
 from splatmill_worker.splat.machine import resident_memory
 from splatmill_worker.splat.train.curve import CurvePoint
 from splatmill_worker.splat.train.renderer import evaluation_background, renderer
@@ -189,7 +190,16 @@ class Evaluations:
         return self.final
 
     def _all(self) -> FinalScores:
-        return self._of(self._held_out, finally_evaluated(trained_on(self._run)))
+        distances = self._distances() if self._run.plan.lpips and self._held_out else None
+        return self._of(self._held_out, finally_evaluated(trained_on(self._run)), distances)
+
+    def _distances(self) -> Distances | None:
+        """LPIPS's networks; None, with a warning, where their files went since training began."""
+        try:
+            return Distances.read()
+        except ValueError as error:
+            self._run.warn(f"{error}")
+            return None
 
     def _validation(self) -> float | None:
         """Mean PSNR of the views that are set aside, with their cameras as given; None where there are none."""
@@ -198,11 +208,16 @@ class Evaluations:
         background = evaluation_background(run.plan, run.views)
         return evaluate(renderer(run.engine, run.plan), aside, background).psnr if aside else None
 
-    def _of(self, held_out: Sequence[TrainingView], training: Sequence[TrainingView]) -> FinalScores:
+    def _of(
+        self,
+        held_out: Sequence[TrainingView],
+        training: Sequence[TrainingView],
+        distances: Distances | None = None,
+    ) -> FinalScores:
         run = self._run
         render, background = renderer(run.engine, run.plan), evaluation_background(run.plan, run.views)
         return FinalScores(
-            evaluate(render, held_out, background) if held_out else None,
+            evaluate(render, held_out, background, distances) if held_out else None,
             evaluate(render, training, background),
         )
 

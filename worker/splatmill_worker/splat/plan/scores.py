@@ -1,0 +1,19 @@
+"""The decision on what is measured at the end beside PSNR and SSIM."""
+
+from __future__ import annotations
+
+from splatmill.schema import TrainOptions
+from splatmill_worker.splat.plan.facts import Facts
+from splatmill_worker.splat.plan.reasons import Decision, switch
+
+
+def decide_lpips(facts: Facts, options: TrainOptions) -> Decision[bool]:
+    """Whether LPIPS of the held-out photos is measured at the end."""
+    if facts.no_lpips is not None:
+        return Decision(False, facts.no_lpips)
+    if not facts.held_out:
+        return Decision(False, "LPIPS is measured on held-out photos, and there are none.")
+    because = (
+        f"The weights of LPIPS are installed; it is measured on {facts.held_out} held-out photos at the end."
+    )
+    return switch(options.lpips, Decision(True, because))
