@@ -18,7 +18,13 @@ from splatmill.backplane import memory
 from splatmill.backplane.jobs import events
 from splatmill.backplane.queue import entries, leases
 from splatmill.backplane.storage import bucket, storage
-from splatmill.schema import MAX_PHOTO_PIXELS, MIN_PHOTO_SIDE, CreateJob, TrainOptions
+from splatmill.schema import (
+    MAX_PHOTO_PIXELS,
+    MIN_PHOTO_SIDE,
+    PHOTOS_PER_VALIDATION,
+    CreateJob,
+    TrainOptions,
+)
 from splatmill.transfer import chunked_uploads
 from splatmill_server import webhooks
 from splatmill_server.access import keys
@@ -188,7 +194,7 @@ SENTENCES: list[tuple[str, Callable[[], str]]] = [
     (
         "report",
         lambda: (
-            f"one in {word(photos.PHOTOS_PER_VALIDATION)} of the training photos is set aside, at most "
+            f"one in {word(PHOTOS_PER_VALIDATION)} of the training photos is set aside, at most "
             f"{word(photos.MOST_VALIDATION)}"
         ),
     ),

@@ -63,6 +63,7 @@ if TYPE_CHECKING:
     from splatmill.schema.fit_image import FitImageOptions
     from splatmill.schema.frames import GeographicOrigin, KnownDistance, ModelFrame, known_distance
     from splatmill.schema.options import (
+        PHOTOS_PER_VALIDATION,
         PRESET_GAIN,
         PRESET_LONGEST,
         PRESET_STEPS,
@@ -268,6 +269,7 @@ __all__ = [
     "MOST_MARKS",
     "OUTPUT_MARKS",
     "OUTPUT_MEDIA",
+    "PHOTOS_PER_VALIDATION",
     "PHOTO_SUFFIXES",
     "POSTER",
     "PRESET_GAIN",

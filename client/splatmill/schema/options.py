@@ -39,6 +39,10 @@ PRESET_GAIN = {Preset.draft: 0.5, Preset.balanced: 0.2, Preset.quality: 0.05}
 """dB on validation photos: a preset ends the training once the last doubling of the steps has gained less
 (decisions: PRESET_GAIN)."""
 
+PHOTOS_PER_VALIDATION = 12
+"""Training photos for each one that is set aside to measure what a doubling gains: fewer than are held out, since
+training misses them."""
+
 
 def preset_steps(preset: Preset, photos: int) -> int:
     """Return the number of steps that a training of so many photos is laid out for where no budget is given."""
@@ -385,6 +389,19 @@ class TrainOptions(Request):
     def ending(self) -> Preset:
         """The preset that ends a training without a budget: quality where a target may end it sooner."""
         return self.preset if self.target_psnr is None else Preset.quality
+
+    def doubles(self, photos: int) -> bool:
+        """Whether a training on so many photos doubles the steps of its preset while that gains enough: where no budget
+        is given, and some of the photos can be set aside to measure it.
+        """
+        budgeted = self.steps is not None or self.time_budget is not None
+        return not budgeted and (self.target_psnr is not None or photos >= PHOTOS_PER_VALIDATION)
+
+    def held_out_of(self, photos: int) -> int:
+        """How many of so many photos are held out, where none says of itself that it is."""
+        if self.test_views is not None:
+            return min(photos, len(self.test_views))
+        return -(-photos // self.holdout) if self.holdout else 0
 
     @property
     def start_file(self) -> str | None:

@@ -66,9 +66,10 @@ def _cameras(request: EstimateJob, here: Sequence[Figures]) -> StageEstimate:
 
 
 def _training(request: EstimateJob, here: Sequence[Figures]) -> StageEstimate:
-    options = request.options
+    options, photos = request.options, request.photos
+    trained = max(1, photos - options.held_out_of(photos))
     steps, limit = (
-        steps_of(options, request.photos),
+        steps_of(options, trained),
         math.inf if options.time_budget is None else options.time_budget,
     )
     if steps is None:
@@ -76,7 +77,7 @@ def _training(request: EstimateJob, here: Sequence[Figures]) -> StageEstimate:
     alike = _nearest(
         here,
         lambda figures: (
-            _ratio(figures.photos, request.photos)
+            _ratio(figures.photos, photos)
             + 0.5 * _ratio(figures.steps, steps)
             + _size_distance(figures, options)
         ),
@@ -89,9 +90,11 @@ def _training(request: EstimateJob, here: Sequence[Figures]) -> StageEstimate:
         return StageEstimate(stage="training", because="No such job has finished on this server yet.")
     each = [figures.train / figures.steps * _size_factor(figures, options) for figures in alike]
     longest, may = steps, ""
-    if options.steps is None:
+    if options.doubles(trained):
         longest = PRESET_LONGEST * steps
         may = f", or fewer, or up to {longest} while doubling them gains enough"
+    elif options.steps is None:
+        may = f", since {trained} training photos are too few to measure what more would gain"
     elif options.target_psnr is not None:
         may = ", at most, since training may end earlier"
     stage = _stage(
@@ -115,7 +118,7 @@ def _rest(request: EstimateJob, here: Sequence[Figures]) -> StageEstimate:
 
 
 def steps_of(options: TrainOptions, photos: int) -> int | None:
-    """Return the number of steps that the options ask for with so many photos, or None where time limits them."""
+    """Return the number of steps for so many training photos, or None where time limits them."""
     if options.steps is not None:
         return options.steps
     if options.time_budget is not None:

@@ -11,9 +11,10 @@ import pytest
 from splatmill.backplane import lists
 from splatmill.backplane.jobs.row import now
 from splatmill.backplane.storage import layout
-from splatmill.schema import EstimateJob
+from splatmill.schema import EstimateJob, TrainOptions
 from splatmill_server.jobs.estimate import estimate
 from splatmill_server.jobs.finished import Figures, figures
+from tests.support.facts import changed, planned
 from tests.support.formats import V1, job_ids
 from tests.support.served_app import ServedApp, problem
 
@@ -52,7 +53,9 @@ def seconds(request: dict[str, Any], *finished: Figures) -> list[float | None]:
 def test_stages_are_scaled_by_photos_and_steps() -> None:
     assert seconds({"photos": 20}, job()) == [10.0, 60.0, 7.0]
     assert seconds({"photos": 40}, job()) == [20.0, 60.0, 9.0]
-    assert seconds({"photos": 200}, job())[1] == 144.0  # 36 steps for each photo
+    assert (
+        seconds({"photos": 200}, job())[1] == 126.0
+    )  # 36 steps for each of the 175 photos that are trained on
     assert seconds({"photos": 20, "options": {"preset": "draft"}}, job())[1] == 20.0
     assert seconds({"photos": 20, "options": {"steps": 6000}}, job())[1] == 120.0
     assert seconds({"photos": 20, "options": {"target_psnr": 30}}, job())[1] == 200.0  # of the preset quality
@@ -65,6 +68,26 @@ def test_a_preset_may_take_as_long_as_its_doubled_steps() -> None:
         assert (f"up to {round(highest * 50)} while doubling them gains enough" in training.because) == (
             "steps" not in options
         )
+
+
+def test_a_preset_is_not_doubled_where_the_plan_does_not_double_it() -> None:
+    """Of 13 photos two are held out, and of the eleven others the plan sets none aside."""
+    for photos, options, doubled in (
+        (13, {}, False),
+        (14, {}, True),
+        (12, {"holdout": 0}, True),
+        (30, {"test_views": [f"{each}.jpg" for each in range(19)]}, False),
+        (13, {"target_psnr": 30}, True),
+    ):
+        training = estimate(
+            EstimateJob.model_validate({"photos": photos, "options": options}), [job()]
+        ).stages[1]
+        assert training.seconds is not None
+        assert training.highest == training.seconds * (4 if doubled else 1)
+        trained = photos - TrainOptions.model_validate(options).held_out_of(photos)
+        plan = planned(changed(views=trained), **options)
+        assert (plan.schedule.longest is not None) == doubled
+        assert ("too few to measure" in training.because) == (not doubled)
 
 
 def test_a_time_budget_is_the_time_of_the_training() -> None:

@@ -7,6 +7,7 @@ Does not prove that a longer run gains on real captures: worker/bench/decisions.
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,7 @@ import torch
 
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.plan.rates import Annealing, boost_of
-from splatmill_worker.splat.train import checkpoint, curve
+from splatmill_worker.splat.train import checkpoint, curve, observers
 from splatmill_worker.splat.train.loop import Hooks, train
 from splatmill_worker.splat.train.run import TrainingRun
 from splatmill_worker.splat.train.snapshot import Snapshot
@@ -41,6 +42,22 @@ def test_a_budget_is_doubled_while_that_gains_up_to_the_longest() -> None:
     assert [point.step for point in trained.curve] == [4, 11, 22, 40, 60, 80, 120, 160, 240, 320, 400]
     assert [point.step for point in trained.curve if point.validation_psnr is not None][-1] == 240
     assert trained.stopped.startswith("the budget is spent; the last doubling gained ")
+
+
+@pytest.mark.parametrize(("least", "said", "end"), [(0.0, [400], 400), (50.0, [400, 60], 60)])
+def test_what_is_done_and_what_is_left_never_go_back(
+    least: float, said: list[int], end: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The longest run is said first, and what it becomes once that is decided."""
+    monkeypatch.setattr(observers, "PROGRESS_SECONDS", 0.0)
+    reports: list[observers.TrainingProgress] = []
+    views, held_out = split()
+    train(first_engine(), views, held_out, course(least), extent=1.1, hooks=Hooks(progress=reports.append))
+    assert (len(reports), reports[-1].step, reports[-1].steps) == (end, end, end)
+    assert list(dict.fromkeys(report.steps for report in reports)) == said
+    for before, after in pairwise(reports):
+        assert after.step / after.steps >= before.step / before.steps
+        assert after.steps - after.step <= before.steps - before.step
 
 
 @pytest.mark.parametrize(("least", "longest", "steps"), [(0.0, None, 100), (0.0, 150, 150), (50.0, 400, 60)])

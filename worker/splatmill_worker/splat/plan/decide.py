@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from splatmill.schema import Background, TrainOptions
+from splatmill.schema import PHOTOS_PER_VALIDATION, Background, TrainOptions
 from splatmill_worker.kernels.records import BETA2
 from splatmill_worker.splat.plan.capacity import decide_capacity, decide_densification
 from splatmill_worker.splat.plan.culling import decide_culling
 from splatmill_worker.splat.plan.facts import Facts
 from splatmill_worker.splat.plan.needs import FEW_VIEWS, needs_of
 from splatmill_worker.splat.plan.photos import (
-    PHOTOS_PER_VALIDATION,
     decide_antialias,
     decide_background,
     decide_exposure,

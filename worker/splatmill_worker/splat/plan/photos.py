@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from typing import Literal
 
-from splatmill.schema import PRESET_GAIN, Background, Preset, Switch, TrainOptions, format_bytes
+from splatmill.schema import (
+    PHOTOS_PER_VALIDATION,
+    PRESET_GAIN,
+    Background,
+    Preset,
+    Switch,
+    TrainOptions,
+    format_bytes,
+)
 from splatmill_worker.splat.plan.facts import Facts
 from splatmill_worker.splat.plan.needs import FEW_VIEWS
 from splatmill_worker.splat.plan.plan import Kernels
@@ -35,12 +43,9 @@ departs from them may be smooth, and held-out photos share it (decisions: LIGHT_
 CERTAIN = 3.0
 """Standard errors of an exposure that a departure exceeds at least, to be one."""
 
-PHOTOS_PER_VALIDATION = 12
-"""Training photos for each one that is set aside: fewer than are held out, since training misses them. From
-MANY_VISITS on they are set aside under a budget as well (decisions: best-validated)."""
-
 MOST_VALIDATION = 8
-"""Photos that are set aside at most: they are measured whole at every point of the curve."""
+"""Photos that are set aside at most: they are measured whole at every point of the curve. From MANY_VISITS on they are
+set aside under a budget as well (decisions: best-validated)."""
 
 PHOTO_SHARE = 1 / 8
 """Share of the memory of a run that photos may take in it (decisions: photos-on-disk)."""
@@ -193,8 +198,7 @@ def least_gain(facts: Facts, options: TrainOptions) -> float | None:
     That of the preset where no budget is given; 0 where training ends only once it over-fits; None where a target alone
     ends it before its budget.
     """
-    by_preset = options.steps is None and options.time_budget is None
-    if by_preset and (options.target_psnr is not None or facts.views >= PHOTOS_PER_VALIDATION):
+    if options.doubles(facts.views):
         return PRESET_GAIN[options.ending]
     return 0.0 if options.target_psnr is None else None
 

@@ -36,7 +36,8 @@ class TrainingProgress:
     """Where a run stands.
 
     step: training steps so far.
-    steps: steps of the whole run, estimated under a time budget.
+    steps: steps of the whole run, estimated under a time budget. Where the budget may be doubled, they are those of the
+        longest run until that is decided, so that the share which is done never falls.
     loss: training loss of the last step.
     gaussians: how many the scene has.
     seconds: training time so far.
@@ -64,7 +65,8 @@ class ProgressReports:
     def observe(self, run: TrainingRun) -> None:
         """Report."""
         self._last = time.monotonic()
-        step, progress, seconds = run.state.step, run.progress, run.clock.seconds
+        step, seconds = run.state.step, run.clock.seconds
+        progress = run.longest.progress(step, seconds)
         steps = max(step, step if progress <= 0 else round(step / progress))
         eta = seconds * (1.0 - progress) / max(progress, 1e-6)
         self._report(TrainingProgress(step, steps, run.loss, run.engine.count, seconds, eta))

@@ -12,7 +12,7 @@ from torch import Tensor
 from splatmill_worker.errors import FailureName, TrainingFailed
 from splatmill_worker.kernels.records import Rates
 from splatmill_worker.splat.engine.protocol import Engine, StepResult
-from splatmill_worker.splat.plan.budget import Clock
+from splatmill_worker.splat.plan.budget import Budget, Clock
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.plan.rates import RateSchedule, boost_of
 from splatmill_worker.splat.train.curve import validated
@@ -88,6 +88,16 @@ class TrainingRun:
     def progress(self) -> float:
         """Share of the budget that is spent, 0 to 1."""
         return self.state.budget.progress(self.state.step, self.clock.seconds)
+
+    @property
+    def longest(self) -> Budget:
+        """The budget as long as it may still become: the longest that the plan allows, until the last photos to decide
+        by are trained on.
+        """
+        longest, budget = self.plan.schedule.longest, self.state.budget
+        if longest is None or budget.steps is None or self.state.shortened or not self.set_aside:
+            return budget
+        return replace(budget, steps=max(budget.steps, longest))
 
     def advance(self) -> None:
         """Take one step, and densify where the schedule says so. Raises TrainingFailed for a numerical failure."""
