@@ -6,7 +6,7 @@ Does not prove speed, nor that true matches of photos pass.
 import numpy as np
 
 from splatmill_worker.sfm.features import Features
-from splatmill_worker.sfm.matching.matcher import MAX_ANGLE, MAX_RATIO, Matcher
+from splatmill_worker.sfm.matching.matcher import CACHED_BYTES, MAX_ANGLE, MAX_RATIO, Matcher
 
 
 def random_features(count: int, seed: int) -> Features:
@@ -36,3 +36,10 @@ def test_matches_are_the_mutual_nearest_that_pass_the_ratio_test() -> None:
             expected.add((row, int(first)))
     assert found == expected
     assert found == {(k, 100 + k) for k in range(10, 200)}
+
+
+def test_descriptors_that_are_kept_stay_within_their_bound() -> None:
+    for count, most in ((300, None), (300, 100), (6000, 6000)):
+        photos = [random_features(count, 0)] * 3
+        kept = Matcher(photos, most)._directions.cache_parameters()["maxsize"]
+        assert 2 <= kept <= CACHED_BYTES / (min(count, most or count) * 128 * 4)
