@@ -9,7 +9,7 @@ from pydantic import ValidationError
 from splatmill import errors
 from splatmill.cli.exits import Exit, print_error
 from splatmill.schema import PROBLEMS, CameraSpec, Problem
-from splatmill.sdk.aio import train_options
+from splatmill.transfer.training_options import train_options
 
 
 @pytest.mark.parametrize("code", sorted(PROBLEMS))

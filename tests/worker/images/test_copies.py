@@ -183,7 +183,8 @@ def grids(rng: np.random.Generator, count: int) -> npt.NDArray[np.float32]:
     result = np.stack(turned)
     result -= result.mean(axis=(1, 2), keepdims=True)
     result *= EXACT / np.linalg.norm(result, axis=(1, 2), keepdims=True)
-    return np.rint(result).astype(np.float32)
+    rounded: npt.NDArray[np.float32] = np.rint(result).astype(np.float32)
+    return rounded
 
 
 def nearest_of_all_pairs(

@@ -48,7 +48,7 @@ def test_a_budget_is_doubled_while_that_gains_up_to_the_longest() -> None:
 def test_what_is_done_and_what_is_left_never_go_back(
     least: float, said: list[int], end: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The longest run is said first, and what it becomes once that is decided."""
+    """The number of steps is that of the longest run at first, and what it becomes once that is decided."""
     monkeypatch.setattr(observers, "PROGRESS_SECONDS", 0.0)
     reports: list[observers.TrainingProgress] = []
     views, held_out = split()
