@@ -89,6 +89,26 @@ class Presentations:
             if await run_in_threadpool(self._store, model_id, before, after, picture, who):
                 return after
 
+    async def inherit(self, model_id: str, new_id: str, who: Caller, client: str) -> None:
+        """Show a model as the one that it was made from, with a picture of its own.
+
+        Where that has no start view, the new one begins where its first held-out photo was taken, or its first photo.
+        """
+        shown = await run_in_threadpool(self.get, model_id)
+        change = ChangePresentation.model_validate(shown.model_dump(exclude_defaults=True))
+        if shown.start_view is None:
+            change.start_view = await run_in_threadpool(self._first_view, new_id)
+        await self.save(new_id, change, who, client)
+
+    def _first_view(self, model_id: str) -> CameraSpec | None:
+        if self._storage.head(layout.model_file(model_id, "cameras.json")) is None:
+            return None
+        cameras = self._models.get_cameras(model_id).cameras
+        first = next(
+            (camera for camera in cameras if camera.split == "test"), cameras[0] if cameras else None
+        )
+        return None if first is None else first.camera
+
     def _known(self, model_id: str) -> tuple[Presentation, bool]:
         """Return what is stored, and whether the model has a picture from its start view. Raises problems."""
         self._models.check(model_id)

@@ -9,7 +9,7 @@ import { build } from "esbuild";
 export const USED = [
   "AppBase", "AppOptions", "Asset", "CameraComponentSystem", "Color", "createGraphicsDevice", "DEVICETYPE_WEBGL2", "Entity",
   "GSPLATDATA_LARGE", "GSplatComponentSystem", "GSplatHandler", "Mat4", "Picker", "Quat", "SHADERLANGUAGE_GLSL", "ShaderChunks",
-  "TextureHandler", "TONEMAP_NONE", "version",
+  "TextureHandler", "TONEMAP_NONE", "version", "WORKBUFFER_UPDATE_ONCE",
 ];
 
 /** The viewer draws with WebGL 2, so the shaders of WebGPU are left out: each of their modules exports an empty text. */

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 from splatmill import AsyncClient, Client
 from splatmill.backplane.storage import layout
@@ -81,6 +82,15 @@ def test_a_part_of_a_model_becomes_a_new_one(app: ServedApp, folder: Path, tmp_p
             30,
         )
         assert client.model(MODEL).model.gaussians == 400
+        assert half.presentation().start_view == VIEWS[0], (
+            "it begins where the first held-out photo was taken"
+        )
+        with Image.open(half.download(tmp_path / "poster.jpg", file="poster.jpg")) as picture:
+            assert picture.size == (1280, 853)
+        model.present(annotations=[{"point": (0, 0, 1), "text": "The top"}], start_view=VIEWS[1])
+        again = model.edit(box=RIGHT)
+        assert again.model is not None
+        assert client.model(again.model).presentation() == model.presentation(), "what was written is kept"
         for wrong in ({}, {"box": {"min": [0, 0, 0], "max": [0, 1, 1]}}, {"min_opacity": 2.0}):
             with pytest.raises(InvalidRequest):
                 model.edit(**wrong)

@@ -4,6 +4,7 @@ import secrets
 from typing import Annotated
 
 import httpx
+import structlog
 from fastapi import APIRouter, Body, Request
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import JSONResponse, Response
@@ -23,6 +24,8 @@ from splatmill_server.service import Service, Shared
 from splatmill_server.space.quota import Arrival
 
 router = APIRouter(prefix="/v1/models", tags=["models"])
+
+log = structlog.get_logger()
 
 _EXAMPLE = {"box": {"min": [-1, -1, -1], "max": [1, 1, 1]}, "min_opacity": 0.05, "preview": True}
 
@@ -58,6 +61,14 @@ async def edit_model(
         return await _edit(service, model_id, request, body, room)
 
 
+async def _show_as_before(service: Service, model_id: str, new_id: str, request: Request) -> None:
+    """Give a new model the annotations of the one it was made from, and a picture. It is whole without them."""
+    try:
+        await service.presentations.inherit(model_id, new_id, request.state.caller, client_of(request))
+    except ProblemError as error:
+        log.warning("an edited model has no picture", model=new_id, reason=error.problem.detail)
+
+
 async def _edit(
     service: Service, model_id: str, request: Request, body: EditModel, room: Arrival | None
 ) -> Response:
@@ -80,6 +91,7 @@ async def _edit(
         if room is not None:
             new_id = await store_edited(service.storage, model_id, body, edited, answer.aiter_raw(), room)
             await run_in_threadpool(service.models.list_new, new_id)
+            await _show_as_before(service, model_id, new_id, request)
             edited = edited.model_copy(update={"model": new_id})
     except httpx.TransportError as error:
         raise ProblemError(

@@ -12,6 +12,7 @@
  *
  * @import {Camera, Pose, Vec} from "./viewer/pose.js"
  * @import {Source} from "./viewer/source.js"
+ * @import {LeftOut} from "./viewer/left_out.js"
  * @import {Line, ShownCamera} from "./viewer/overlay.js"
  */
 import { bytes } from "./format.js";
@@ -378,13 +379,23 @@ export class View extends EventTarget {
     this.again();
   }
 
+  /**
+   * Show what an edit would leave out, dimmed or not at all; null shows everything as ever. Pictures by the server do not.
+   * @param {LeftOut | null} limits
+   */
+  leaveOut(limits) {
+    this.limits = limits;
+    if (this.surface instanceof Splats) this.surface.leaveOut(limits);
+    this.again();
+  }
+
   /** Draw cameras as frusta. @param {ShownCamera[]} cameras */
   showCameras(cameras) {
     this.overlay.cameras = cameras;
     this.again();
   }
 
-  /** Draw lines, marked points and a box. @param {{lines?: Line[], points?: Vec[], box?: {min: Vec, max: Vec} | null}} marks */
+  /** Draw lines, marked points and a box. @param {{lines?: Line[], paths?: Line[], points?: Vec[], box?: {min: Vec, max: Vec} | null}} marks */
   mark(marks) {
     Object.assign(this.overlay, marks);
     this.again();

@@ -1,23 +1,25 @@
-// Cropping and cleaning: a box drawn in the view, a least opacity, a largest size. The server measures what an edit does on
-// the held-out photos, and makes a new model of what is left; this one is kept.
+// Cropping and cleaning: a box drawn in the view, a least opacity, a largest size. The view shows what is left out; the server
+// measures what that does to the held-out photos, and makes a new model of what is left. This one is kept.
 
 import { send } from "../api.js";
 import { h, toggle } from "../dom.js";
 import { number } from "../format.js";
 import { noticeOf } from "../shell.js";
+import { BoxHandles, boxAround } from "../viewer/box_handles.js";
 import { LOADING } from "../viewer/errors.js";
 
 /**
  * @import {Stage} from "./stage.js"
  * @import {View} from "../viewer.js"
+ * @import {Box} from "../viewer/box_handles.js"
  * @import {Vec} from "../viewer/pose.js"
  */
 
+/** The axes of a model, and their directions where its frame.json says how they were chosen. */
 const AXES = ["x", "y", "z"];
-/** Steps of a slider of the box, from one end of its range to the other. */
-const STEPS = 200;
-/** Half the range of the box around the point that the photos look at, over the farthest camera's distance from the mean. */
-const REACH = 3;
+const DIRECTED = ["x, to the right", "y, downwards", "z, to the front"];
+/** Length of the box at first, over the width or height that is in sight where the view turns about. */
+const SHARE = 0.5;
 
 export class Edit {
   /** @param {Stage} stage */
@@ -25,30 +27,47 @@ export class Edit {
     this.stage = stage;
     /** @type {View | null} */
     this.view = null;
+    /** @type {BoxHandles | null} */
+    this.handles = null;
     this.on = false;
+    /** In the coordinates of the model. @type {Box} */
+    this.box = { min: [-1, -1, -1], max: [1, 1, 1] };
+    this.began = false;
+    /** What is chosen, and what was before, to go back to. */
+    this.chosen = "";
+    /** @type {string[]} */
+    this.before = [];
     this.button = toggle("Crop and clean", (on) => this.turn(on));
-    this.crop = h("input", { type: "checkbox", id: "edit-crop", checked: true, onchange: () => this.draw() });
-    /** The sliders of min and max along each axis. */
-    this.ends = AXES.map((axis) => ["from", "to"].map((end) => h("input", {
-      type: "range", min: 0, max: STEPS, value: end === "from" ? (3 * STEPS) / 8 : (5 * STEPS) / 8,
-      "aria-label": `The box along ${axis}, ${end}`, oninput: () => this.draw(),
+    const change = () => this.change();
+    const legends = stage.shown.model.files.some((/** @type {any} */ file) => file.name === "frame.json") ? DIRECTED : AXES;
+    this.crop = h("input", { type: "checkbox", id: "edit-crop", checked: true, onchange: change });
+    /** The fields of min and max along each axis. */
+    this.ends = AXES.map((axis, i) => ["from", "to"].map((end) => h("input", {
+      type: "number", step: "any", class: "narrow-field", "aria-label": `The box along ${axis}, ${end}`, onchange: () => this.typed(i, end),
     })));
-    this.opacity = h("input", { id: "edit-opacity", type: "number", min: 0, max: 0.99, step: 0.01, value: 0, class: "narrow-field" });
-    this.size = h("input", { id: "edit-size", type: "number", min: 0, step: "any", placeholder: "no limit", class: "narrow-field" });
+    this.opacity = h("input", { id: "edit-opacity", type: "number", min: 0, max: 0.99, step: 0.01, value: 0, class: "narrow-field", oninput: () => this.draw(), onchange: change });
+    this.size = h("input", { id: "edit-size", type: "number", min: 0, step: "any", placeholder: "no limit", class: "narrow-field", oninput: () => this.draw(), onchange: change });
+    this.sizeLabel = h("label", { for: "edit-size" });
+    this.look = h("select", { id: "edit-look", onchange: () => this.draw() },
+      h("option", { value: "dimmed" }, "dimmed"), h("option", { value: "hidden" }, "hidden"), h("option", { value: "shown" }, "as ever"));
     this.state = h("div", { role: "status" });
+    this.undoButton = h("button", { type: "button", class: "quiet", disabled: true, onclick: () => this.undo() }, "Undo");
     this.measureButton = h("button", { type: "button", onclick: () => void this.run(true) }, "Measure what it does");
     this.makeButton = h("button", { type: "submit", class: "primary" }, "Make a new model");
+    this.unit = h("p", { class: "hint" });
     this.panel = h("form", { class: "panel card", novalidate: true, hidden: true, "aria-label": "Crop and clean", onsubmit: (/** @type {Event} */ event) => {
       event.preventDefault();
       void this.run(false);
     } },
       h("h2", {}, "Crop and clean"),
-      h("div", { class: "row" }, this.crop, h("label", { for: "edit-crop" }, "Keep only what lies in the box")),
-      h("div", { class: "box-ends" }, AXES.map((axis, i) => h("fieldset", {}, h("legend", {}, axis), this.ends[i]))),
+      h("div", { class: "row" }, this.crop, h("label", { for: "edit-crop" }, "Keep only what lies in the box, whose sides are moved by the handles in the view")),
+      h("div", { class: "box-ends" }, legends.map((legend, i) => h("fieldset", {}, h("legend", {}, legend), h("div", { class: "row" }, this.ends[i][0], "to", this.ends[i][1])))),
+      this.unit,
       h("div", { class: "row" },
-        h("div", { class: "field" }, h("label", { for: "edit-opacity" }, "Least opacity"), this.opacity),
-        h("div", { class: "field" }, h("label", { for: "edit-size" }, "Largest size, in units"), this.size)),
-      h("div", { class: "row" }, this.measureButton, this.makeButton),
+        h("div", { class: "field" }, h("label", { for: "edit-opacity" }, "Least opacity, 0 to 0.99"), this.opacity),
+        h("div", { class: "field" }, this.sizeLabel, this.size),
+        h("div", { class: "field" }, h("label", { for: "edit-look" }, "What is left out is"), this.look)),
+      h("div", { class: "row" }, this.measureButton, this.makeButton, this.undoButton),
       this.state,
       h("p", { class: "hint" }, "This model is kept. The error is measured on up to 16 held-out photos, which show what lies outside of a box, so a crop raises it."));
   }
@@ -56,6 +75,18 @@ export class Edit {
   /** @param {View} view */
   attach(view) {
     this.view = view;
+    if (!this.began) {
+      const { width, height } = view.getCamera();
+      this.box = boxAround(view.focus, SHARE * view.distance * Math.tan(view.fovY / 2) * Math.min(1, width / height));
+      this.began = true;
+    }
+    this.handles?.dispose();
+    this.handles = new BoxHandles(view, (box, done) => {
+      this.box = box;
+      if (done) this.change();
+      else this.draw();
+    });
+    this.chosen = this.snapshot();
     this.draw();
   }
 
@@ -66,17 +97,66 @@ export class Edit {
     this.draw();
   }
 
-  /** The box in the coordinates of the model. */
-  get box() {
-    const { focus, spread } = /** @type {View} */ (this.view);
-    const at = (/** @type {number} */ axis, /** @type {number} */ end) =>
-      focus[axis] + REACH * spread * ((2 * Number(this.ends[axis][end].value)) / STEPS - 1);
-    const ends = [0, 1, 2].map((axis) => [at(axis, 0), at(axis, 1)].sort((a, b) => a - b));
-    return { min: /** @type {Vec} */ (ends.map((end) => end[0])), max: /** @type {Vec} */ (ends.map((end) => end[1])) };
+  /** Length in the shown unit of 1 in the model. */
+  get factor() {
+    return this.stage.presentation.scale?.factor ?? 1;
+  }
+
+  snapshot() {
+    return JSON.stringify({ box: this.box, crop: this.crop.checked, opacity: this.opacity.value, size: this.size.value });
+  }
+
+  /** Take over what was chosen, and keep what was before it. */
+  change() {
+    const now = this.snapshot();
+    if (this.chosen && now !== this.chosen) this.before.push(this.chosen);
+    this.chosen = now;
+    this.draw();
+  }
+
+  undo() {
+    const chosen = this.before.pop();
+    if (!chosen) return;
+    this.chosen = chosen;
+    const { box, crop, opacity, size } = JSON.parse(chosen);
+    this.box = box;
+    this.crop.checked = crop;
+    [this.opacity.value, this.size.value] = [opacity, size];
+    this.draw();
+    if (!this.before.length) this.opacity.focus();
+  }
+
+  /** Take over an end of the box as it was typed. @param {number} axis @param {string} end "from" or "to" */
+  typed(axis, end) {
+    const field = this.ends[axis][end === "from" ? 0 : 1];
+    const value = field.value === "" ? NaN : Number(field.value) / this.factor;
+    const [from, to] = end === "from" ? [value, this.box.max[axis]] : [this.box.min[axis], value];
+    const valid = Number.isFinite(value) && from !== to;
+    this.state.replaceChildren(valid ? "" : h("p", { class: "error" }, `Give the box along ${AXES[axis]} as two different numbers.`));
+    if (valid) {
+      const [min, max] = [/** @type {Vec} */ ([...this.box.min]), /** @type {Vec} */ ([...this.box.max])];
+      [min[axis], max[axis]] = [Math.min(from, to), Math.max(from, to)];
+      this.box = { min, max };
+    }
+    this.change();
   }
 
   draw() {
-    this.view?.mark({ box: this.on && this.crop.checked ? this.box : null });
+    const { factor, on, crop } = this;
+    const unit = this.stage.presentation.scale?.unit;
+    this.handles?.show(on && crop.checked ? this.box : null);
+    const text = (/** @type {number} */ value) => String(Number((value * factor).toPrecision(4)));
+    this.ends.forEach(([from, to], axis) => {
+      [from.value, to.value] = [text(this.box.min[axis]), text(this.box.max[axis])];
+      from.disabled = to.disabled = !crop.checked;
+    });
+    this.unit.textContent = unit ? `Lengths are in ${unit}.` : "Lengths are in units of the model. Measure sets another unit.";
+    this.sizeLabel.textContent = `Largest size, in ${unit ?? "units"}`;
+    this.undoButton.disabled = !this.before.length;
+    const [opacity, size] = [Number(this.opacity.value) || 0, Number(this.size.value) / factor || 0];
+    this.view?.leaveOut(on && this.look.value !== "shown" ? {
+      box: crop.checked ? this.box : null, opacity, size: size > 0 ? size : Infinity, hidden: this.look.value === "hidden",
+    } : null);
   }
 
   /** Why there is nothing to ask the server for, a sentence; it leads to the field that is to be changed. */
@@ -102,7 +182,7 @@ export class Edit {
     const edit = {
       ...(this.crop.checked ? { box: this.box } : {}),
       ...(Number(this.opacity.value) > 0 ? { min_opacity: Number(this.opacity.value) } : {}),
-      ...(Number(this.size.value) > 0 ? { max_size: Number(this.size.value) } : {}),
+      ...(Number(this.size.value) > 0 ? { max_size: Number(this.size.value) / this.factor } : {}),
       preview,
     };
     this.measureButton.disabled = this.makeButton.disabled = true;

@@ -12,6 +12,7 @@ import { Stage } from "./stage.js";
 import { binned } from "../bin.js";
 import { figures } from "../figures.js";
 import { renameButton } from "../naming.js";
+import { originOf } from "./origin.js";
 import { openSharing } from "../sharing.js";
 import { confirmAction, noticeOf, startShell } from "../shell.js";
 
@@ -54,11 +55,12 @@ async function show(shown) {
   showName(model);
   byId("lead").append(...figures(model), ` · ${bytes(model.bytes)} · made ${ago(model.created_at)}`);
   byId("actions").append(...actions(shown));
+  void originOf(shown.report).then((origin) => origin && byId("lead").after(origin));
   byId("whole").hidden = false;
   showCompare(byId("compare"), shown);
   void showDownloads(byId("downloads"), shown);
-  void showOrbit(byId("orbit"), shown);
   const stage = new Stage(shown);
+  void showOrbit(byId("orbit"), shown, stage);
   showCameras(byId("cameras"), shown, stage);
   document.addEventListener("visibilitychange", () => {
     if (!document.hidden) void lookWhere(shown);

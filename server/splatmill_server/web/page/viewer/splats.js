@@ -2,10 +2,12 @@
  * Draws Gaussians with PlayCanvas on a WebGL canvas. A frame is drawn when one is asked for, and when the splats have
  * been sorted anew, so that a view that nobody moves costs nothing.
  *
+ * @import {LeftOut} from "./left_out.js"
  * @import {Pose, Vec} from "./pose.js"
  * @import {Source} from "./source.js"
  */
 import { ViewerError } from "./errors.js";
+import { MODIFIER, parametersOf } from "./left_out.js";
 import { opened } from "./source.js";
 
 /** Name of a uniform: the centre and radius of the sphere outside of which nothing is drawn; radius 0 draws all. */
@@ -88,6 +90,8 @@ export class Splats {
     this.splats = null;
     /** @type {any} */
     this.picker = null;
+    /** @type {LeftOut | null} */
+    this.limits = null;
     this.gaussians = 0;
     this.loads = 0;
   }
@@ -120,6 +124,7 @@ export class Splats {
     this.splats = new pc.Entity("splats");
     this.splats.addComponent("gsplat", { asset });
     app.root.addChild(this.splats);
+    this.leaveOut(this.limits);
     this.gaussians = asset.resource.gsplatData.numSplats;
     if (before) {
       const old = app.assets.get(before.gsplat.asset);
@@ -133,6 +138,17 @@ export class Splats {
   /** The positions of the Gaussians, x, y and z in turn; null where they are not known. @returns {Float32Array | null} */
   get points() {
     return this.app.assets.get(this.splats?.gsplat.asset)?.resource.centers ?? null;
+  }
+
+  /** Show what an edit would leave out, dimmed or not at all; null shows everything as ever. @param {LeftOut | null} limits */
+  leaveOut(limits) {
+    const changed = limits !== null || this.limits !== null;
+    this.limits = limits;
+    const component = this.splats?.gsplat;
+    if (!component || !changed) return;
+    component.setWorkBufferModifier(limits && { glsl: MODIFIER });
+    for (const [name, value] of Object.entries(limits ? parametersOf(limits) : {})) component.setParameter(name, value);
+    component.workBufferUpdate = this.pc.WORKBUFFER_UPDATE_ONCE;
   }
 
   /** @param {number} width @param {number} height  of the drawing buffer, in pixels */

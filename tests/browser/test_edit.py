@@ -1,0 +1,132 @@
+"""Crop and clean on the page of a model in a real browser: what the view shows of an edit before it is made, the
+handles of the box, units, and going back.
+
+Does not prove what an edit keeps (tests/worker/render_service/test_edit.py), nor how the page asks for one
+(test_model_page.py).
+"""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from PIL import Image
+from playwright.sync_api import Locator, Page, expect
+
+from tests.browser.conftest import SmallModel
+from tests.browser.test_model_page import WAIT, show
+from tests.support.up import Up
+
+
+@pytest.fixture
+def panel(service: Up, page: Page, model: SmallModel) -> Locator:
+    show(page, model)
+    page.get_by_role("button", name="Crop and clean").click()
+    return page.get_by_role("form", name="Crop and clean")
+
+
+def picture(page: Page) -> npt.NDArray[np.float64]:
+    """The view at rest without what is drawn over it: two pictures of it in a row are the same."""
+    before = None
+    for _ in range(40):
+        page.evaluate(
+            "document.querySelectorAll('.handles').forEach((each) => { each.style.visibility = 'hidden'; })"
+        )
+        with Image.open(io.BytesIO(page.locator(".view").screenshot())) as shot:
+            now = np.asarray(shot.convert("RGB")) / 255.0
+        page.evaluate(
+            "document.querySelectorAll('.handles').forEach((each) => { each.style.visibility = ''; })"
+        )
+        if before is not None and np.array_equal(before, now):
+            return now
+        before = now
+        page.wait_for_timeout(300)
+    raise AssertionError("the view does not come to rest")
+
+
+def differs(a: npt.NDArray[np.float64], b: npt.NDArray[np.float64]) -> float:
+    return float(np.abs(a - b).mean())
+
+
+def test_the_view_shows_what_is_left_out(panel: Locator, page: Page) -> None:
+    tool = page.get_by_role("button", name="Crop and clean")
+    tool.click()
+    closed = picture(page)
+    tool.click()
+    look = panel.get_by_label("What is left out is")
+    look.select_option("shown")
+    panel.get_by_label("Keep only what lies in the box").uncheck()
+    whole = picture(page)
+    look.select_option("hidden")
+    assert differs(picture(page), whole) < 1e-3, "nothing is left out yet"
+    panel.get_by_label("Least opacity").fill("0.9")
+    clear = picture(page)
+    assert clear.mean() < 0.8 * whole.mean(), "what is left out is not drawn"
+    look.select_option("dimmed")
+    assert differs(picture(page), clear) > 0.01
+    panel.get_by_label("Least opacity").fill("0")
+    panel.get_by_label("Largest size").fill("0.0001")
+    look.select_option("hidden")
+    assert picture(page).mean() < 0.05, "all are larger"
+    panel.get_by_label("Largest size").fill("")
+    panel.get_by_label("Keep only what lies in the box").check()
+    boxed = picture(page)
+    assert boxed.mean() < 0.95 * whole.mean(), "what lies outside is not drawn"
+    tool.click()
+    assert differs(picture(page), closed) < 1e-3, "the tool leaves the view as it was"
+
+
+def test_the_box_is_moved_by_its_handles_and_back(panel: Locator, page: Page) -> None:
+    ends = {end: panel.get_by_label(f"The box along x, {end}") for end in ("from", "to")}
+    first = {end: float(field.input_value()) for end, field in ends.items()}
+    undo = panel.get_by_role("button", name="Undo")
+    expect(undo).to_be_disabled()
+    handle = page.get_by_role("button", name="Side of the box at the end of x")
+    handle.focus()
+    page.keyboard.press("ArrowLeft")
+    after = float(ends["to"].input_value())
+    assert first["from"] < after < first["to"]
+    box = handle.bounding_box()
+    assert box is not None
+    middle = (box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    page.mouse.move(*middle)
+    page.mouse.down()
+    page.mouse.move(middle[0] + 40, middle[1] + 40, steps=4)
+    page.mouse.up()
+    dragged = float(ends["to"].input_value())
+    assert dragged != after
+    assert float(ends["from"].input_value()) == first["from"], "the other side stays"
+    undo.click()
+    assert float(ends["to"].input_value()) == after
+    undo.click()
+    assert float(ends["to"].input_value()) == first["to"]
+    expect(undo).to_be_disabled()
+    ends["from"].fill(str(first["to"] + 1))
+    ends["from"].press("Tab")
+    assert float(ends["from"].input_value()) == first["to"], "a box has no side of less than nothing"
+
+
+def test_lengths_are_in_the_unit_of_the_model(service: Up, page: Page, model: SmallModel) -> None:
+    address = f"/v1/models/{model.id}/presentation"
+    service.http.patch(address, json={"scale": {"factor": 10, "unit": "cm"}})
+    try:
+        show(page, model)
+        page.get_by_role("button", name="Crop and clean").click()
+        panel = page.get_by_role("form", name="Crop and clean")
+        expect(panel).to_contain_text("Lengths are in cm.")
+        panel.get_by_label("Largest size, in cm").fill("5")
+        low = float(panel.get_by_label("The box along y, from").input_value())
+        asked: list[Any] = []
+        page.on(
+            "request",
+            lambda request: asked.append(request.post_data_json) if "/edits" in request.url else None,
+        )
+        panel.get_by_role("button", name="Measure what it does").click()
+        expect(panel.get_by_role("status")).to_contain_text("left out", timeout=WAIT)
+        assert asked[0]["max_size"] == pytest.approx(0.5)
+        assert asked[0]["box"]["min"][1] == pytest.approx(low / 10, rel=1e-3)
+    finally:
+        service.http.patch(address, json={"scale": None})
