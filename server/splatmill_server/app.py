@@ -24,6 +24,7 @@ from splatmill_server.base.settings import Settings
 from splatmill_server.middleware import RequestMiddleware
 from splatmill_server.routes import bin as bin_routes
 from splatmill_server.routes import (
+    camera_paths,
     captures,
     edits,
     estimate,
@@ -132,6 +133,7 @@ def _routes() -> Sequence[BaseRoute]:
         edits,
         models,
         orbits,
+        camera_paths,
         presentation,
         shares,
         bin_routes,

@@ -154,7 +154,7 @@ def test_files_and_the_orbit_video_are_there(
     size = service.http.get(f"/v1/models/{model.id}").json()["bytes"]
     downloading.value.save_as(tmp_path / "model.ply")
     assert (tmp_path / "model.ply").stat().st_size == size
-    shown.get_by_label("Length", exact=True).select_option("4")
+    shown.get_by_label("Length, in seconds").fill("4")
     shown.get_by_role("button", name="Make the video").click()
     shown.get_by_role("button", name="Stop").click()
     expect(shown.locator("#orbit .hint")).to_have_text("Stopped.")
@@ -163,11 +163,11 @@ def test_files_and_the_orbit_video_are_there(
     wish = {"seconds": 0.5, "fps": 8, "width": 64, "height": 48}
     made = service.http.post(f"/v1/models/{model.id}/orbits", json=wish).json()
     shown.reload()
-    shown.get_by_role("button", name="Play 64 x 48, 0.5 seconds").click(timeout=WAIT)
+    shown.get_by_role("button", name="Play circle, 64 x 48, 0.5 seconds").click(timeout=WAIT)
     video = shown.locator("#orbit video")
     expect(video).to_have_attribute("src", made["links"]["video"])
     shown.wait_for_function("() => document.querySelector('#orbit video').duration === 0.5", polling=100)
-    shown.get_by_role("button", name="Delete the video 64 x 48").click()
+    shown.get_by_role("button", name="Delete the video circle, 64 x 48").click()
     expect(video).to_have_count(0)
     assert service.http.get(made["links"]["self"]).status_code == 404
 
@@ -275,7 +275,10 @@ def test_a_crop_makes_a_new_model_and_keeps_the_first(service: Up, model: SmallM
     expect(panel.get_by_role("status")).to_contain_text("Nothing would change")
     expect(kept).to_be_focused()
     kept.check()
-    panel.get_by_role("slider", name="The box along x, from").fill("100")
+    ends = [panel.get_by_label(f"The box along x, {end}") for end in ("from", "to")]
+    low, high = (float(end.input_value()) for end in ends)
+    ends[0].fill(str((low + high) / 2))
+    ends[0].press("Tab")
     assert shown.evaluate("document.querySelectorAll('.view canvas').length") == 2
     panel.get_by_role("button", name="Measure what it does").click()
     said = re.compile(r"^[\d,]+ of [\d,]+ Gaussians would be left out: [\d.]+ dB before, [\d.]+ dB after\.$")
@@ -292,6 +295,11 @@ def test_a_crop_makes_a_new_model_and_keeps_the_first(service: Up, model: SmallM
     held = [camera for camera in cameras if camera["split"] == "test"]
     assert sum(camera["psnr"] for camera in held) / len(held) == pytest.approx(made["psnr"])
     assert service.http.get(f"/v1/models/{made['id']}/files/{held[0]['photo']}").status_code == 200
+    expect(shown.locator("#origin")).to_contain_text(
+        "Made from still life without what lies outside of a box."
+    )
+    expect(shown.locator("#origin a")).to_have_attribute("href", re.compile(f"/models/{model.id}$"))
+    assert "poster.jpg" in [file["name"] for file in made["files"]]
     shown.get_by_role("button", name="Delete").click()
     shown.get_by_role("button", name="Delete the model").click()
     shown.wait_for_url("**/models", timeout=WAIT)

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
         Format,
         Matrix,
         MatrixRow,
-        OrbitRequest,
         Output,
         RenderRequest,
         Side,
@@ -237,6 +236,7 @@ if TYPE_CHECKING:
         WebhookPayload,
         WebhookWithSecret,
     )
+    from splatmill.schema.videos import CameraPath, Keyframe, OrbitRequest, Trace, TraceRequest
 
 __all__ = [
     "ARCHIVE_SUFFIXES",
@@ -293,6 +293,7 @@ __all__ = [
     "Binned",
     "Box",
     "ByteSize",
+    "CameraPath",
     "CameraSpec",
     "CamerasEvent",
     "Capture",
@@ -342,6 +343,7 @@ __all__ = [
     "KeyLimits",
     "KeyList",
     "KeyWithSecret",
+    "Keyframe",
     "Kind",
     "KnownDistance",
     "Lan",
@@ -414,6 +416,8 @@ __all__ = [
     "StoredRecord",
     "Switch",
     "Time",
+    "Trace",
+    "TraceRequest",
     "TrainOptions",
     "Unread",
     "UnsafeName",

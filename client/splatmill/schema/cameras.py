@@ -1,4 +1,4 @@
-"""Requests for rendered images and videos, and the cameras they are rendered from.
+"""Requests for rendered images, and the cameras they are rendered from.
 
 A camera has a pose, a 4x4 row-major camera-to-world matrix with OpenCV axes (x right, y down, z forward) or OpenGL
 axes (x right, y up, z backward), and a pinhole projection in pixels. Pixel centres lie at half-integers.
@@ -69,7 +69,7 @@ class CameraSpec(Request):
                 "The camera's intrinsics are given twice: give fx, fy, cx and cy in pixels, or "
                 "fov_y_deg alone."
             )
-        _check_rigid(self.camera_to_world)
+        check_rigid(self.camera_to_world)
         return self
 
     @classmethod
@@ -240,31 +240,6 @@ class RenderRequest(Request):
         return json.dumps(shown | camera, sort_keys=True, separators=(",", ":")).encode()
 
 
-class OrbitRequest(Request):
-    """A video (MP4) from a camera that circles the scene once."""
-
-    seconds: float = Field(default=6.0, ge=0.5, le=60, description="Length of the video in seconds.")
-    fps: int = Field(default=24, ge=1, le=60, description="Frames per second.")
-    width: int = Field(
-        default=640, ge=16, le=3840, multiple_of=2, description="Width in pixels; must be even."
-    )
-    height: int = Field(
-        default=480, ge=16, le=2160, multiple_of=2, description="Height in pixels; must be even."
-    )
-    fov_y_deg: float | None = Field(
-        default=None,
-        gt=1,
-        lt=170,
-        description="Vertical field of view in degrees. Left out, that of the training cameras.",
-    )
-    background: Literal["black", "white"] = Field(default="black", description="Colour behind the model.")
-
-    @property
-    def frames(self) -> int:
-        """The number of frames in the video."""
-        return max(1, round(self.seconds * self.fps))
-
-
 def check_pixels(width: int, height: int) -> None:
     """Raise ValueError for an image of more than MAX_RENDER_PIXELS pixels."""
     if width * height > MAX_RENDER_PIXELS:
@@ -284,7 +259,8 @@ def _unit(v: Sequence[float], otherwise: str) -> tuple[float, float, float]:
     return (v[0] / length, v[1] / length, v[2] / length)
 
 
-def _check_rigid(m: Matrix) -> None:
+def check_rigid(m: Matrix) -> None:
+    """Raise ValueError unless a camera-to-world matrix is a rotation and a position."""
     if not all(math.isfinite(x) for row in m for x in row):
         raise ValueError("camera_to_world holds a number that is not finite.")
     if any(abs(x - y) > 1e-6 for x, y in zip(m[3], (0, 0, 0, 1), strict=True)):

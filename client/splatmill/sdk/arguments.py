@@ -11,6 +11,7 @@ from splatmill.schema import (
     Annotation,
     Backend,
     Background,
+    CameraPath,
     CameraSpec,
     Effort,
     Format,
@@ -75,6 +76,7 @@ class OrbitArguments(TypedDict, total=False):
     height: int
     fov_y_deg: float | None
     background: Literal["black", "white"]
+    camera_path: CameraPath | Mapping[str, Any] | None
 
 
 class PresentationArguments(TypedDict, total=False):
@@ -84,5 +86,6 @@ class PresentationArguments(TypedDict, total=False):
     background: Literal["black", "white"]
     auto_rotate: bool
     scale: Scale | Mapping[str, Any] | None
+    camera_path: CameraPath | Mapping[str, Any] | None
     measurements: Sequence[Measurement | Mapping[str, Any]]
     annotations: Sequence[Annotation | Mapping[str, Any]]

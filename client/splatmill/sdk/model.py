@@ -167,7 +167,7 @@ class AsyncModelHandle:
         keep: bool = True,
         **options: Unpack[OrbitArguments],
     ) -> Path:
-        """Render a video (MP4) that circles the scene, write it to `path`, and return the path written.
+        """Render a video (MP4) that circles the scene or follows a camera path, write it to `path`, and return that.
 
         `options` are the fields of `OrbitRequest`. `timeout` is the number of seconds to wait for the video; left out,
         as long as it takes. `on_progress` is called with the number of frames that are rendered.

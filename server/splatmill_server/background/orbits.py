@@ -350,7 +350,12 @@ def _line_of(owner: str) -> str:
 
 
 def _id_of(etag: str, request: OrbitRequest) -> str:
-    parts = [_VERSION, etag, request.model_dump_json()]
+    # Without a path as before there were any, so that videos which are stored keep their ids.
+    parts = [
+        _VERSION,
+        etag,
+        request.model_dump_json(exclude={"camera_path"} if request.camera_path is None else None),
+    ]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:16]
 
 

@@ -147,6 +147,24 @@ def test_a_video_around_the_scene(ball: Path, tmp_path: Path, run_here, cameras:
 
 
 @pytest.mark.slow
+def test_a_video_of_a_path(ball: Path, tmp_path: Path, run_here):
+    sides = [CameraSpec.looking_at((x, 0, 0), (0, 0, 0), width=64, height=48) for x in (4, -4)]
+    keyframes = [{"camera_to_world": side.camera_to_world, "fov_y_deg": 50} for side in sides]
+    (tmp_path / "path.json").write_text(json.dumps({"keyframes": keyframes}))
+    size = ("--seconds", "0.5", "--fps", "8", "--width", "64", "--height", "48")
+    status, stdout, stderr = run_here(
+        "orbit", ball, "-o", tmp_path / "p.mp4", "--path", tmp_path / "path.json", *size
+    )
+    assert (status, stdout) == (0, f"{tmp_path / 'p.mp4'}\n"), stderr
+    assert "circles" not in stderr
+    with av.open(str(tmp_path / "p.mp4")) as video:
+        frames = [frame.to_ndarray(format="rgb24")[24, 32].astype(int) for frame in video.decode(video=0)]
+    assert len(frames) == 4
+    assert frames[0][0] > frames[0][2], "it begins at the red side"
+    assert frames[-1][0] < frames[-1][2], "and ends at the blue one"
+
+
+@pytest.mark.slow
 def test_a_file_that_is_no_model(tmp_path: Path):
     (tmp_path / "x.ply").write_bytes(b"ply\nnonsense")
     status, _, stderr = run("render", tmp_path / "x.ply", "-o", tmp_path / "view.png")
@@ -165,6 +183,8 @@ def test_a_file_that_is_no_model(tmp_path: Path):
         (["render", "ball.ply", "--up", "y"], Exit.usage, "--up is for a file without cameras"),
         (["render", "ball.ply", "-o", "v.webp", "--output", "depth"], Exit.refused, "Depth cannot be a webp"),
         (["orbit", "ball.ply", "--width", "33"], Exit.refused, "multiple of 2"),
+        (["orbit", "ball.ply", "--path", "gone.json"], Exit.usage, "There is no file gone.json"),
+        (["orbit", "ball.ply", "--path", "cameras.json"], Exit.refused, "keyframes"),
         (["orbit", "0123456789abcdef", "--up", "y"], Exit.usage, "--up is for a file without cameras"),
     ],
 )

@@ -28,6 +28,7 @@ READS = {
     "/v1/models/{model_id}/orbit",
     "/v1/session",
     "/v1/estimate",
+    "/v1/camera-paths",
 }
 """Addresses whose POST and DELETE change no record."""
 

@@ -21,7 +21,7 @@ import pytest
 from splatmill.backplane import keys
 from splatmill.backplane.storage import layout
 from splatmill.errors import InvalidRequest, NotFound, ServerError, WaitTimeout
-from splatmill.schema import Progress
+from splatmill.schema import OrbitRequest, Progress
 from splatmill.sdk.client import Client
 from splatmill_server.background import orbits
 from splatmill_server.space import usage
@@ -154,6 +154,13 @@ def test_a_video_is_rendered_in_the_background_kept_and_found_again(app: ServedA
     assert app.http.delete(f"/v1/models/{MODEL}/orbits/{other['id']}").status_code == 204
     assert [found["id"] for found in app.http.get(ORBITS).json()["orbits"]] == [made["id"]]
     problem(app.http.get(other["links"]["video"]), 404, "orbit_not_found")
+
+
+def test_a_request_without_a_path_keeps_the_id_that_it_had_before_there_were_paths() -> None:
+    assert orbits._id_of("etag", OrbitRequest()) == "2a714c9d1a750889"
+    view = {"camera_to_world": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], "fov_y_deg": 50}
+    path = OrbitRequest.model_validate({"camera_path": {"keyframes": [view, view]}})
+    assert orbits._id_of("etag", path) != "2a714c9d1a750889"
 
 
 def test_a_video_that_is_deleted_is_not_rendered_any_further(

@@ -1,11 +1,12 @@
 """Proves that the path of an orbit video fits the cameras of the photos, and that its cameras look at the target."""
 
 import math
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
-from splatmill.schema import OrbitRequest
+from splatmill.schema import CameraPath, CameraSpec, Keyframe, OrbitRequest
 from splatmill_worker.render_service import orbit
 
 
@@ -48,3 +49,25 @@ def test_orbit_cameras_look_at_the_target() -> None:
         seen = camera.project(path.target[None])
         assert (*seen.columns, *seen.rows) == pytest.approx((32.0, 24.0), abs=1e-6)
         assert rotation[1] @ np.array([0.0, 0.0, 1.0]) < 0, "the picture's down must not be the world's up"
+
+
+def test_the_cameras_of_a_video_follow_a_path() -> None:
+    views = [
+        Keyframe(
+            camera_to_world=CameraSpec.looking_at(eye, (0, 0, 0), width=4, height=3).camera_to_world,
+            fov_y_deg=fov,
+        )
+        for eye, fov in (((4, 0, 1), 40), ((0, 4, 0), 50), ((-4, 0, 1), 60))
+    ]
+    wish = {"seconds": 1, "fps": 11, "width": 64, "height": 48}
+    for closed in (False, True):
+        request = OrbitRequest.model_validate(
+            wish | {"camera_path": CameraPath(keyframes=views, closed=closed)}
+        )
+        cameras = list(orbit.orbit_cameras(None, cast(Any, None), request))
+        assert len(cameras) == request.frames == 11
+        first = CameraSpec.looking_at((4, 0, 1), (0, 0, 0), width=64, height=48, fov_y_deg=40)
+        assert cameras[0].viewmat == pytest.approx(np.array(first.viewmat()), abs=1e-9)
+        assert cameras[0].fy == pytest.approx(first.pinhole()[1])
+        eye = np.linalg.inv(cameras[-1].viewmat)[:3, 3]
+        assert (np.linalg.norm(eye - np.array([-4, 0, 1])) < 1e-6) == (not closed)

@@ -1,4 +1,4 @@
-"""The camera path of an orbit video, fitted to the positions from which the photos were taken."""
+"""The cameras of a video: on a circle fitted to the positions from which the photos were taken, or on a given path."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from splatmill.schema import ModelCameras, OrbitRequest
+from splatmill.schema import CameraPath, ModelCameras, OrbitRequest
 from splatmill_worker.scene import Camera, looked_at, viewmat_of
 from splatmill_worker.splat.gaussians import Gaussians
 
@@ -122,16 +122,31 @@ def cameras_along(path: OrbitPath, request: OrbitRequest, fov_y_deg: float) -> I
         )
 
 
+def cameras_on(path: CameraPath, request: OrbitRequest) -> Iterable[Camera]:
+    """Yield one camera per frame on a path. The last is at its end, or one frame before its start if it is closed."""
+    steps = request.frames if path.closed else max(1, request.frames - 1)
+    for index in range(request.frames):
+        view = path.at(index / steps)
+        focal = 0.5 * request.height / math.tan(math.radians(view.fov_y_deg) / 2)
+        pose = np.array(view.camera_to_world)
+        viewmat = viewmat_of(pose[:3, :3].T, pose[:3, 3])
+        yield Camera(
+            request.width, request.height, focal, focal, request.width / 2, request.height / 2, viewmat
+        )
+
+
 def orbit_cameras(
     stored: ModelCameras | None, gaussians: Gaussians, request: OrbitRequest, up: Float = UP
 ) -> Iterable[Camera]:
-    """Return the cameras of an orbit video of a model.
+    """Return the cameras of a video of a model.
 
     stored: the cameras of its photos; None, or fewer than two, gives a circle around the dense middle.
     gaussians: the model.
-    request: number and size of the frames, and the field of view if given.
+    request: number and size of the frames, the field of view if given, and the path in place of a circle if given.
     up: the coordinate axis that points up where there are no cameras, [3].
     """
+    if request.camera_path is not None:
+        return cameras_on(request.camera_path, request)
     if stored is None or len(stored.cameras) < 2:
         return cameras_along(path_of(gaussians, up), request, request.fov_y_deg or DEFAULT_FOV)
     poses = np.array([camera.camera.opencv_to_world() for camera in stored.cameras])

@@ -9,7 +9,7 @@ from splatmill.cli.local.local_model import is_local, local_cameras, orbit_local
 from splatmill.cli.servers import ServerOption, open_client
 
 if TYPE_CHECKING:
-    from splatmill.schema import CameraSpec, ModelCamera
+    from splatmill.schema import CameraPath, CameraSpec, ModelCamera
     from splatmill.sdk.client import ModelHandle
 
 ModelOrFile = Annotated[
@@ -110,6 +110,14 @@ def orbit(
     fps: Annotated[int, typer.Option(min=1, max=60, help="Frames per second.")] = 24,
     width: Annotated[int, typer.Option(min=16, max=3840, help="Width in pixels; must be even.")] = 640,
     height: Annotated[int, typer.Option(min=16, max=2160, help="Height in pixels; must be even.")] = 480,
+    path: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="JSON file with a camera path as in the API (`CameraPath`), to follow in place of a circle.",
+            show_default=False,
+        ),
+    ] = None,
     up: Up = None,
     keep: Annotated[
         bool,
@@ -120,14 +128,16 @@ def orbit(
     ] = True,
     server: ServerOption = None,
 ) -> None:
-    """Render a video that circles the scene of a model on a server, or in a file on this machine.
+    """Render a video that circles the scene, or follows a path, of a model on a server or in a file on this machine.
 
     Ctrl-C cancels the video on the server.
     """
     options: dict[str, Any] = {"seconds": seconds, "fps": fps, "width": width, "height": height}
+    if path is not None:
+        options["camera_path"] = _read_path(path)
     if is_local(model_id):
-        cameras = local_cameras(Path(model_id))
-        _check_up(up, used=not cameras)
+        cameras = local_cameras(Path(model_id)) if path is None else []
+        _check_up(up, used=not cameras and path is None)
         orbit_local(Path(model_id), out, options, with_cameras=bool(cameras), up=up or "-y")
     _check_up(up, used=False)
     with open_client(server) as client:
@@ -188,6 +198,20 @@ def _camera(
     else:
         chosen = next((entry for entry in cameras if entry.split == "test"), cameras[0]).camera
     return chosen.scaled_to(width) if width is not None else chosen
+
+
+def _read_path(path: Path) -> "CameraPath":
+    from pydantic import ValidationError
+
+    from splatmill.errors import invalid_request
+    from splatmill.schema import CameraPath
+
+    if not path.is_file():
+        raise typer.BadParameter(f"There is no file {path}.", param_hint="--path")
+    try:
+        return CameraPath.model_validate_json(path.read_bytes())
+    except ValidationError as error:
+        raise invalid_request(error) from error
 
 
 def _read_camera(path: Path) -> "CameraSpec":

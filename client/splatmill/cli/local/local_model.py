@@ -80,7 +80,7 @@ def orbit_local(
         request = OrbitRequest.model_validate(options)
     except ValidationError as error:
         raise invalid_request(error) from error
-    if not with_cameras:
+    if not with_cameras and request.camera_path is None:
         typer.echo(f"The camera circles the dense middle of the scene, with {up} up.", err=True)
     cameras = ("--cameras", str(_cameras_path(model))) if with_cameras else ()
     _run("orbit-file", model, out, request.model_dump_json(exclude_none=True), up, *cameras)

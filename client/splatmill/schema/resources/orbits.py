@@ -6,9 +6,9 @@ from typing import Annotated, Any, Self
 from pydantic import BeforeValidator, Field, model_validator
 
 from splatmill.schema.base import Request, Response, Time
-from splatmill.schema.cameras import OrbitRequest
 from splatmill.schema.ids import ID
 from splatmill.schema.problems import Problem
+from splatmill.schema.videos import OrbitRequest
 
 
 class OrbitState(StrEnum):

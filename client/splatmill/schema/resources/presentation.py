@@ -7,6 +7,7 @@ from pydantic import AfterValidator, Field
 from splatmill.schema.base import Label, Request, Response, without_controls
 from splatmill.schema.cameras import CameraSpec
 from splatmill.schema.resources.edits import Point
+from splatmill.schema.videos import CameraPath
 
 POSTER = "poster.jpg"
 """The file of a model with its picture from the start view that was chosen for it."""
@@ -54,6 +55,9 @@ class Presentation(Response):
     )
     scale: Scale | None = Field(
         default=None, description="What lengths are shown in. Left out, in units of the model."
+    )
+    camera_path: CameraPath | None = Field(
+        default=None, description="A camera path for videos, which the page of the model shows."
     )
     measurements: list[Measurement] = Field(default_factory=list, max_length=MOST_MARKS)
     annotations: list[Annotation] = Field(default_factory=list, max_length=MOST_MARKS)

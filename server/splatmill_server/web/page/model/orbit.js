@@ -1,13 +1,18 @@
-// Orbit videos: rendered by the server in the background, kept with the model, played here, and saved.
+// Videos on a circle or on a camera path: rendered by the server in the background, kept with the model, played here, and saved.
 
 import { get, request, send } from "../api.js";
 import { h } from "../dom.js";
 import { bytes } from "../format.js";
 import { noticeOf } from "../shell.js";
 
-/** @import {Shown} from "./model.js" */
+/**
+ * @import {Shown} from "./model.js"
+ * @import {Stage} from "./stage.js"
+ */
 
-const SIZES = { "640 x 480": [640, 480], "960 x 720": [960, 720], "1280 x 720": [1280, 720] };
+const SIZES = {
+  "640 x 480": [640, 480], "960 x 720": [960, 720], "1280 x 720": [1280, 720], "1920 x 1080": [1920, 1080], "1080 x 1920": [1080, 1920],
+};
 
 /** Milliseconds between two looks how far a video is. */
 const LOOK_MS = 500;
@@ -15,10 +20,12 @@ const LOOK_MS = 500;
 /**
  * @param {HTMLElement} section
  * @param {Shown} shown
+ * @param {Stage} stage
  */
-export async function showOrbit(section, { model, address, background }) {
+export async function showOrbit(section, { model, address, background }, stage) {
+  const way = h("select", { id: "orbit-way" }, h("option", { value: "circle" }, "circles the scene"), h("option", { value: "path" }, "follows the camera path"));
   const size = h("select", { id: "orbit-size" }, Object.keys(SIZES).map((name) => h("option", {}, name)));
-  const length = h("select", { id: "orbit-length" }, [4, 6, 10].map((seconds) => h("option", { value: seconds }, `${seconds} seconds`)));
+  const length = h("input", { id: "orbit-length", type: "number", min: 0.5, max: 60, step: "any", value: 6, class: "narrow-field" });
   const make = h("button", { type: "button", onclick: start }, "Make the video");
   const stop = h("button", { type: "button", class: "quiet", hidden: true }, "Stop");
   const state = h("p", { class: "hint", role: "status" });
@@ -28,10 +35,22 @@ export async function showOrbit(section, { model, address, background }) {
 
   async function start() {
     const [width, height] = SIZES[/** @type {keyof typeof SIZES} */ (size.value)];
-    make.disabled = true;
     place.replaceChildren();
+    const path = way.value === "path" ? stage.path.path : null;
+    if (way.value === "path" && !path) {
+      state.textContent = "There is no camera path yet: add two views to it at least, with Camera path above.";
+      stage.path.button.focus();
+      return;
+    }
+    length.setAttribute("aria-invalid", String(!length.checkValidity()));
+    if (!length.checkValidity() || !length.value) {
+      state.textContent = "A video has 0.5 to 60 seconds.";
+      length.focus();
+      return;
+    }
+    make.disabled = true;
     try {
-      await follow(await send("POST", `${address}/orbits`, { seconds: Number(length.value), width, height, background }));
+      await follow(await send("POST", `${address}/orbits`, { seconds: Number(length.value), width, height, background, ...(path ? { camera_path: path } : {}) }));
     } catch (error) {
       place.append(noticeOf(/** @type {Error} */ (error)));
     } finally {
@@ -78,8 +97,8 @@ export async function showOrbit(section, { model, address, background }) {
   /** @param {any} orbit */
   function play(orbit) {
     place.replaceChildren(
-      h("video", { src: orbit.links.video, controls: true, loop: true, playsinline: true, "aria-label": "Video that circles the scene" }),
-      h("p", {}, h("a", { href: orbit.links.video, download: `${model.name || model.id}-orbit.mp4` }, "Save the video")));
+      h("video", { src: orbit.links.video, controls: true, loop: true, playsinline: true, "aria-label": orbit.request.camera_path ? "Video of the camera path" : "Video that circles the scene" }),
+      h("p", {}, h("a", { href: orbit.links.video, download: `${model.name || model.id}-${orbit.request.camera_path ? "path" : "orbit"}.mp4` }, "Save the video")));
   }
 
   /** List the videos that are kept, and return those that are not whole yet. */
@@ -88,7 +107,7 @@ export async function showOrbit(section, { model, address, background }) {
     const orbits = (await get(`${address}/orbits`)).orbits;
     kept.replaceChildren(...orbits.filter(({ state }) => state === "succeeded").map((orbit) => {
       const { width, height, seconds } = orbit.request;
-      const name = `${width} x ${height}, ${seconds} seconds, ${bytes(orbit.bytes)}`;
+      const name = `${orbit.request.camera_path ? "camera path" : "circle"}, ${width} x ${height}, ${seconds} seconds, ${bytes(orbit.bytes)}`;
       return h("li", {},
         h("button", { type: "button", class: "quiet", onclick: () => play(orbit) }, `Play ${name}`),
         h("button", { type: "button", class: "quiet", "aria-label": `Delete the video ${name}`, onclick: () => remove(orbit) }, "Delete"));
@@ -107,11 +126,12 @@ export async function showOrbit(section, { model, address, background }) {
     }
   }
 
-  section.append(h("h2", { id: "orbit-title" }, "Orbit video"),
-    h("p", { class: "muted" }, "The camera circles the scene once, as high and as far away as the photos were taken."),
+  section.append(h("h2", { id: "orbit-title" }, "Video"),
+    h("p", { class: "muted" }, "A circle is as high and as far away as the photos were taken. A camera path leads through views that you choose."),
     h("div", { class: "row" },
+      h("div", { class: "field" }, h("label", { for: "orbit-way" }, "The camera"), way),
       h("div", { class: "field" }, h("label", { for: "orbit-size" }, "Size"), size),
-      h("div", { class: "field" }, h("label", { for: "orbit-length" }, "Length"), length)),
+      h("div", { class: "field" }, h("label", { for: "orbit-length" }, "Length, in seconds"), length)),
     h("div", { class: "row" }, make, stop), bar, state, place, kept);
   try {
     const [unfinished] = await list();

@@ -9,6 +9,7 @@ import { HELP } from "../viewer/controls.js";
 import { savePicture } from "../viewer/presented.js";
 import { Turning } from "../viewer/turning.js";
 import { Annotate } from "./annotate.js";
+import { CameraPath } from "./camera_path.js";
 import { Edit } from "./edit.js";
 import { Measure } from "./measure.js";
 import { timeLapse } from "./time_lapse.js";
@@ -50,6 +51,7 @@ export class Stage {
     this.measure = new Measure(this);
     this.annotate = new Annotate(this);
     this.visitors = new Visitors(this);
+    this.path = new CameraPath(this);
     this.edit = new Edit(this);
     this.scale = h("div", { class: "depth-scale number", hidden: true });
     byId("toolbar").append(this.kind,
@@ -60,10 +62,11 @@ export class Stage {
       this.measure.button,
       this.annotate.button,
       this.edit.button,
+      this.path.button,
       this.visitors.button,
       h("button", { type: "button", onclick: () => void this.savePicture() }, "Save a picture"),
       document.fullscreenEnabled ? h("button", { type: "button", class: "push", onclick: () => void byId("viewer").requestFullscreen() }, "Full screen") : "");
-    byId("panels").append(this.scale, this.measure.panel, this.annotate.panel, this.edit.panel, this.visitors.panel);
+    byId("panels").append(this.scale, this.measure.panel, this.annotate.panel, this.edit.panel, this.path.panel, this.visitors.panel);
   }
 
   /** Open the view of a kind, with the camera of the one before. @param {"webgl" | "pictures" | "depth"} kind */
@@ -95,13 +98,17 @@ export class Stage {
     view.addEventListener("range", (event) => this.showScale(/** @type {CustomEvent} */ (event).detail));
     view.addEventListener("pick-camera", (event) => {
       const { name } = /** @type {CustomEvent} */ (event).detail;
-      this.lookFrom(shown.cameras.find((entry) => entry.name === name));
+      const photo = shown.cameras.find((entry) => entry.name === name);
+      const keyframe = this.path.cameras.find((entry) => entry.name === name);
+      if (photo) this.lookFrom(photo);
+      else if (keyframe) view.setCamera(keyframe.camera);
     });
     this.turnButton.setAttribute("aria-pressed", "false");
     this.turning = new Turning(view, (on) => this.turnButton.setAttribute("aria-pressed", String(on)));
     this.scale.hidden = view.kind !== "depth";
     this.measure.attach(view);
     this.annotate.attach(view);
+    this.path.attach(view);
     this.aim(null);
     this.edit.attach(view);
     this.toggleCameras(this.showing.cameras);
@@ -161,10 +168,11 @@ export class Stage {
   /** @param {boolean} on */
   toggleCameras(on) {
     this.showing.cameras = on;
-    this.view?.showCameras(on ? this.shown.cameras.map((entry) => ({
+    const photos = on ? this.shown.cameras.map((entry) => ({
       name: entry.name, camera: entry.camera, selected: entry.name === this.selected,
       color: entry.split === "test" ? "#f0a061" : "#8fb2ff",
-    })) : []);
+    })) : [];
+    this.view?.showCameras([...photos, ...this.path.cameras]);
     this.tell();
   }
 

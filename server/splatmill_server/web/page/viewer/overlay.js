@@ -26,6 +26,8 @@ export class Overlay {
     this.cameras = [];
     /** @type {Line[]} */
     this.lines = [];
+    /** Ways of cameras. @type {Line[]} */
+    this.paths = [];
     /** @type {Vec[]} */
     this.points = [];
     /** @type {{min: Vec, max: Vec} | null} */
@@ -48,7 +50,7 @@ export class Overlay {
     context.setTransform(1, 0, 0, 1, 0, 0);
     context.clearRect(0, 0, canvas.width, canvas.height);
     this.tips = [];
-    if (!this.cameras.length && !this.lines.length && !this.points.length && !this.box) return;
+    if (!this.cameras.length && !this.lines.length && !this.paths.length && !this.points.length && !this.box) return;
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
     const [width, height] = [canvas.width / ratio, canvas.height / ratio];
     const style = getComputedStyle(canvas);
@@ -98,7 +100,7 @@ export class Overlay {
       for (const [i, j] of EDGES) segment(corner[i], corner[j]);
       stroke(accent, 2);
     }
-    for (const line of this.lines) {
+    for (const line of [...this.paths, ...this.lines]) {
       context.beginPath();
       for (let i = 1; i < line.points.length; i++) segment(line.points[i - 1], line.points[i]);
       stroke(line.color ?? accent, 2);

@@ -13,6 +13,7 @@
  * @property {Scale | null} [scale]
  * @property {Measurement[]} [measurements]
  * @property {Annotation[]} [annotations]
+ * @property {{keyframes: {camera_to_world: number[][], fov_y_deg: number}[], closed: boolean} | null} [camera_path]
  */
 import { Annotations } from "./annotations.js";
 import { HELP } from "./controls.js";
