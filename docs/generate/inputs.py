@@ -264,12 +264,12 @@ def _points() -> list[str]:
         less than {triangulation.CONTRADICTED:.0%} of the matches between photos: then the poses or the intrinsics are
         wrong, or belong to other photos. It names another convention of axes or matrices in which they fit, if one
         does.""",
-        """`--start scan.laz` names a file of points that takes the place of all these. It may be a `.ply` or one of the
+        """`--start scan.laz` names a file of points that are used beside all these. It may be a `.ply` or one of the
         formats below, of which all but text need `pip install 'splatmill-worker[scans]'`:""",
         table(["suffix", "format"], [[code(suffix), name] for suffix, name in POINT_FORMATS.items()]),
         f"""Its coordinates must be those of the cameras, which therefore have to come with the photos; offsets such as
         those of UTM are kept in float64. Of more than {scan.MOST:,} points, evenly chosen ones are read. The photos
-        judge the points as above, and refuse the job where they do not fit, with the share that does.""",
+        judge the points as above, and the job is refused where they do not fit, with the share that does.""",
     ]
 
 

@@ -201,10 +201,10 @@ class TrainOptions(Request):
         default=None,
         max_length=512,
         description=(
-            "Model or points to start from, in place of the points of the reconstruction: the id of a model on the "
-            "server, a model file (.ply, .spz, ...), or a file of points (.las, .laz, .e57, .pcd, .xyz, .pts, .ply), "
-            "given by its path or by its name among the capture's poses. Its coordinates must be those of the "
-            "capture's cameras; points need cameras that came with the photos."
+            "Model to start from, in place of the points of the reconstruction: the id of a model on the server, or "
+            "a model file (.ply, .spz, ...). Or a file of points to start from beside these (.las, .laz, .e57, .pcd, "
+            ".xyz, .pts, .ply). A file is given by its path or by its name among the capture's poses. Coordinates "
+            "must be those of the capture's cameras; points need cameras that came with the photos."
         ),
         json_schema_extra=_PHOTOS,
     )

@@ -4,6 +4,7 @@ The scan is simulated on the still life: true surfaces with the noise of a scann
 training gains from it.
 """
 
+import json
 import shutil
 import subprocess
 import sys
@@ -43,16 +44,20 @@ def load(capture: Path, tmp_path: Path, start: str) -> Scene:
 
 
 @pytest.mark.parametrize("name", ["scan.laz", "scan.ply"])
-def test_points_of_a_scan_take_the_place_of_the_others(name: str, capture: Path, tmp_path: Path) -> None:
+def test_points_of_a_scan_come_beside_those_of_the_photos(name: str, capture: Path, tmp_path: Path) -> None:
     points, colors = scanned()
     (write_las if name.endswith("z") else write_ply)(capture / "poses" / name, points, colors)
+    poses = json.loads((capture / "poses" / "transforms.json").read_text())
+    (capture / "poses" / "transforms.json").write_text(json.dumps({**poses, "ply_file_path": "own.ply"}))
+    write_ply(capture / "poses" / "own.ply", points[:100] + (0, 0, 1e-3), colors[:100])
     scene = load(capture, tmp_path, name)
-    assert scene.facts["loose_points"] == len(points)
-    used = scene.facts["loose_points_used"]
+    assert scene.facts["given_points"] == len(points)
+    used = scene.facts["given_points_used"]
     assert used > 0.8 * len(points)
-    near = np.abs(scene.points[:used, None] - points[None]).max(axis=2).min(axis=1)
+    near = np.abs(scene.points[-used:, None] - points[None]).max(axis=2).min(axis=1)
     assert near.max() < 1e-3
-    assert f"{name} holds {len(points):,} points." in scene.notes
+    assert len(scene.points) > used + 50  # a scan has holes, so that the data set's own points stay
+    assert f"{name} holds {len(points):,} points, of which {used:,} are used" in scene.notes[-1]
     assert start_model_path(capture, tmp_path, TrainOptions(start=name)) is None
 
 
@@ -62,7 +67,7 @@ def test_a_scan_beside_a_zip_of_photos_and_cameras(capture: Path, tmp_path: Path
     (zipped / "poses").mkdir()
     shutil.make_archive(str(zipped / "images" / "all"), "zip", capture)
     write_las(zipped / "poses" / "scan.laz", *scanned())
-    assert load(zipped, tmp_path, "scan.laz").facts["loose_points_used"] > 1000
+    assert load(zipped, tmp_path, "scan.laz").facts["given_points_used"] > 1000
 
 
 @pytest.mark.parametrize("change", ["axes", "units"])

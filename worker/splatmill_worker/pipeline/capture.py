@@ -78,13 +78,11 @@ def posed_scene(
                 ),
                 advice="Correct the poses, or remove them to have the cameras recovered from the photos.",
             ) from error
-        if points is not None:
-            scene = given_points.with_given_points(scene, points)
         scene = posed.with_points(
             scene, workdir, seed=options.seed, on_progress=on_progress, cancelled=cancelled
         )
         if points is not None:
-            given_points.require_shown(scene, points)
+            scene = given_points.with_given_points(scene, points, cancelled)
         return replace(scene, warnings=(*scene.warnings, *one_place.warning(scene)))
     if points is not None:
         raise Refusal(

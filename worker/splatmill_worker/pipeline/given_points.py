@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from splatmill_worker.errors import Refusal
 from splatmill_worker.images.decoding import decoders
 from splatmill_worker.readers import scan
 from splatmill_worker.scene import Scene
+from splatmill_worker.sfm import posed
 from splatmill_worker.wording import plain
 
 HEADER_BYTES = 65_536
@@ -56,10 +58,13 @@ def points_path(capture: Path, options: TrainOptions) -> Path | None:
     return path if end and not any(name in header for name in GAUSSIANS) else None
 
 
-def with_given_points(scene: Scene, path: Path) -> Scene:
-    """The scene with the points of a file in place of its own. They have no tracks: `posed.with_points` judges them.
+def with_given_points(scene: Scene, path: Path, cancelled: Callable[[], bool]) -> Scene:
+    """The scene with those points of a file that its photos show, beside its own: a scan has holes, and no sky.
 
-    Raises Refusal for a file that cannot be read or has no points, and for a format whose library is not installed.
+    The result has no tracks, since those of its own points alone would mean that no photo shows the others.
+
+    Raises Refusal for a file that cannot be read or has no points, for a format whose library is not installed, and
+    where the photos show none of the points; and Cancelled.
     """
     if (module := scan.lacking(path)) is not None:
         raise Refusal(
@@ -75,27 +80,26 @@ def with_given_points(scene: Scene, path: Path) -> Scene:
         raise _unusable(f"The points in {path.name} cannot be read: {plain(error)}.") from error
     if not len(points):
         raise _unusable(f"{path.name} holds no point with finite coordinates.")
-    note = f"{path.name} holds {count:,} points"
-    note += (
-        f", of which {len(points):,}, evenly chosen, are compared with the photos."
-        if len(points) < count
-        else "."
+    judged = posed.with_loose_points(
+        replace(scene, points=points, colors=colors, point_views=None, point_errors=None, notes=()), cancelled
     )
-    return replace(scene, points=points, colors=colors, point_views=None, notes=(*scene.notes, note))
-
-
-def require_shown(scene: Scene, path: Path) -> None:
-    """Raise Refusal where the photos show hardly any of the points that `with_given_points` has given to `scene`."""
-    if scene.facts.get("loose_points") and not scene.facts.get("loose_points_used"):
-        judged = next(
-            (note for note in reversed(scene.notes) if "not used" in note), "No photo shows any of them."
-        )
+    if not len(judged.points):
         raise Refusal(
             "start_unusable",
-            f"The points of {path.name} do not fit the cameras. {judged}",
+            f"The points of {path.name} do not fit the cameras. {' '.join(judged.notes)}",
             advice="Give points and cameras of one coordinate system, such as those that one program has exported "
             "together, or leave out the option start.",
         )
+    note = f"{path.name} holds {count:,} points, of which {len(judged.points):,} are used: photos show their colours."
+    return replace(
+        scene,
+        points=np.concatenate([scene.points, judged.points]),
+        colors=np.concatenate([scene.colors, judged.colors]),
+        point_views=None,
+        point_errors=None,
+        notes=(*scene.notes, note),
+        facts=scene.facts | {"given_points": count, "given_points_used": len(judged.points)},
+    )
 
 
 def _unusable(message: str) -> Refusal:

@@ -73,7 +73,7 @@ def with_points(
     Cancelled.
     """
     scene = orientation.decided(scene, seed=seed, on_progress=on_progress, cancelled=cancelled)
-    scene = _with_loose_points(scene, cancelled)
+    scene = with_loose_points(scene, cancelled)
     if not _lacks_points(scene):
         if _shows_others(scene, cancelled):
             found = _search(scene, workdir, seed, on_progress, cancelled)
@@ -91,7 +91,7 @@ def with_points(
     return replace(scene, facts=scene.facts | {"no_points": _failure(scene, found)})
 
 
-def _with_loose_points(scene: Scene, cancelled: Callable[[], bool]) -> Scene:
+def with_loose_points(scene: Scene, cancelled: Callable[[], bool]) -> Scene:
     """The scene with those of its points without tracks that some photo shows in their colour.
 
     None are kept where photos show the colours hardly more often than exchanged ones: the points then lie in another
