@@ -24,7 +24,7 @@ PARTS = {
     "splatmill_server": ROOT / "server" / "splatmill_server",
     "splatmill_worker": ROOT / "worker" / "splatmill_worker",
 }
-OPS = ("project", "bin", "composite", "loss", "knn")
+OPS = ("project", "bin", "composite", "loss", "knn", "median_depth")
 NOT_ON_GPU = ("correlate",)  # photos are compared before anything is on the device
 
 

@@ -102,6 +102,21 @@ def test_a_bad_tilt_takes_no_other_splats_pixels(backend: str, bad: float) -> No
     assert not found.isnan().any()
 
 
+@pytest.mark.parametrize("backend", ["reference", *BUILDS])
+def test_another_transmittance_is_passed_elsewhere(backend: str) -> None:
+    splats, lists = discs([0.2, 0.4, 0.9], [1.0, 2.0, 3.0]), listed(3)  # 0.8, 0.48 and 0.048 are left
+    with use(backend) as op:
+        for transmittance, depth in ((0.9, 1.0), (0.7, 2.0), (0.4, 3.0)):
+            found = ops.median_depth(splats, lists, 16, 16, transmittance=transmittance, backend=op)
+            assert (found == depth).all()
+
+
+@pytest.mark.parametrize("transmittance", [0.0, 0.05, 1.5, float("nan")])
+def test_a_transmittance_that_no_pixel_has_is_refused(transmittance: float) -> None:
+    with pytest.raises(ValueError, match="transmittance"):
+        ops.median_depth(discs([0.5], [1.0]), listed(1), 16, 16, transmittance=transmittance)
+
+
 def test_tilts_of_another_shape_are_refused() -> None:
     with pytest.raises(ValueError, match="tilts"):
         ops.median_depth(discs([0.5], [1.0]), listed(1), 16, 16, tilts=torch.zeros(1, 3))

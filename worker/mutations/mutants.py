@@ -279,10 +279,10 @@ MUTANTS = [
     cpu("a box is twice as far", "knn.cpp", "d2 += d * d;", "d2 += 4 * d * d;"),
     cpu("a duplicate is no neighbour", "knn.cpp", "uint32_t closer = bits(d2 < nearest.worst());",
         "uint32_t closer = bits((d2 < nearest.worst()) & (d2 > 0.0f));"),
-    cpu("the depth is of three quarters of the light", "median_depth.cpp", "constexpr float kMedian = 0.5f;", "constexpr float kMedian = 0.25f;"),
+    cpu("the depth is of more of the light", "median_depth.cpp", "(T_after <= transmittance)", "(T_after <= 0.5f * transmittance)"),
     cpu("a splat is flat", "median_depth.cpp", "fnma(dx, splat(tilt[0]), splat(1.0f))", "splat(1.0f)"),
     cpu("dim splats count", "median_depth.cpp", "hit = open & (e >= kLog2AlphaMin)", "hit = open & (e >= -9.0f)"),
-    cpu("no horizon", "median_depth.cpp", "half & (nearness > kNearestHorizon)", "half"),
+    cpu("no horizon", "median_depth.cpp", "passed & (nearness > kNearestHorizon)", "passed"),
     # ---- the definition
     reference("the splat before the median", "median_depth.py", "first = crossed.to(torch.uint8).argmax(1)",
               "first = (crossed.to(torch.uint8).argmax(1) - 1).clamp_min(0)"),
@@ -305,7 +305,7 @@ MUTANTS = [
     reference("the border shows nothing", "correlate.py", "clamp(0, width - 1)", "clamp(1, width - 1)"),
     reference("two nearest neighbours", "knn.py", "k = min(NEIGHBORS, n - 1)", "k = min(NEIGHBORS - 1, n - 1)"),
     # ---- Triton's kernels
-    gpu("a finished pixel takes a later depth", "median_depth.py", "through = tl.where(half, 0.0, ", "through = tl.where(half, 0.6, "),
+    gpu("a finished pixel takes a later depth", "median_depth.py", "through = tl.where(passed, 0.0, ", "through = tl.where(passed, 0.6, "),
     gpu("the u v sum is half", "composite_backward.py", "sums = pick(k, SUM_QUV, tl.sum(qu * v, axis=0), sums)",
         "sums = pick(k, SUM_QUV, 0.5 * tl.sum(qu * v, axis=0), sums)"),
     gpu("no gate at 0.999", "composite_backward.py", "tl.where(kept & (raw <= MOST), gain - behind", "tl.where(kept, gain - behind"),

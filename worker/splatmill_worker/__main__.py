@@ -59,6 +59,14 @@ def main(argv: list[str] | None = None) -> int:
     clean.add_argument("--edit", help="EditModel as JSON")
     clean.add_argument("--min-weight", type=float, help="least weight in some photo, pixels")
     clean.add_argument("--image-size", type=int, help="longest side of the photos, pixels")
+    mesh = programs.add_parser("mesh-file", help="make a mesh of a model file")
+    mesh.add_argument("model", type=Path)
+    mesh.add_argument("--out", type=Path, required=True)
+    mesh.add_argument("--cameras", type=Path, help="cameras.json of the model")
+    mesh.add_argument("--faces", type=int, required=True, help="most triangles")
+    mesh.add_argument("--voxel", type=float, help="side of a voxel, units of the model")
+    mesh.add_argument("--box", help="lower and upper corner as JSON")
+    mesh.add_argument("--up", default="-y", help="axis that points up, for a model without cameras")
     text = programs.add_parser("model-text", help="turn the files of a COLMAP model from binary to text")
     text.add_argument("folder", type=Path)
     fit_image = programs.add_parser("fit-image", help="fit one image by Gaussians in a plane")
@@ -101,6 +109,11 @@ def main(argv: list[str] | None = None) -> int:
             from splatmill_worker.render_service.clean import run as clean_run
 
         return clean_run(chosen)
+    if chosen.program == "mesh-file":
+        with uncollected():
+            from splatmill_worker.render_service.mesh import main as mesh_main
+
+        return mesh_main(chosen)
     if chosen.program == "model-text":
         from splatmill_worker.sfm.posed.text import main as text_main
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from . import checks
-from .records import TILE, Bins, Projected
+from .records import MEDIAN, TILE, Bins, Projected
 
 __all__ = [
     "Backend",
@@ -130,21 +130,28 @@ def median_depth(
     height: int,
     *,
     tilts: Tensor | None = None,
+    transmittance: float = MEDIAN,
     backend: Backend | None = None,
 ) -> Tensor:
     """Return the median depth [H,W]: z of the first splat that leaves a transmittance of 1/2 or less, 0 without one.
 
     tilts [N,2]: of the plane that each Gaussian counts as. At the offset d from its mean2d, in pixels, z = depth /
-    (1 - tilt . d); beyond 1000 times its depth there is none. None is 0. Not differentiable.
+    (1 - tilt . d); beyond 1000 times its depth there is none. None is 0. transmittance: in place of 1/2, from 0.1 to
+    1: a larger one is nearer to the camera. Not differentiable.
     """
     name = _backend(backend, projected.means2d)
     kind = _check_projected(projected, name)
     checks.image_size(width, height)
     _check_bins(bins, width, height, kind["device"])
+    if not 0.1 <= transmittance <= 1.0:
+        raise ValueError(f"transmittance: expected 0.1 to 1, got {transmittance}")
     if tilts is None:
         tilts = torch.zeros_like(projected.means2d)
     checks.tensor("tilts", tilts, (len(projected.means2d), 2), **kind)
-    return cast(Tensor, _op(name, "median_depth")(projected, bins, width, height, tilts=tilts))
+    return cast(
+        Tensor,
+        _op(name, "median_depth")(projected, bins, width, height, tilts=tilts, transmittance=transmittance),
+    )
 
 
 def loss(

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from splatmill_worker.kernels import ops
-from splatmill_worker.kernels.records import Projected
+from splatmill_worker.kernels.records import MEDIAN, Projected
 from splatmill_worker.kernels.reference.project import rotation
 from splatmill_worker.scene import Camera
 from splatmill_worker.splat.gaussians import Gaussians
@@ -22,14 +22,14 @@ from splatmill_worker.splat.render import camera_tensors
 
 THINNEST = 0.01
 """Added to both variances of a projected Gaussian, pixels^2, where its depth follows its plane. A disc that is seen
-from the side would have any depth within a pixel."""
+from the side would have any depth within a pixel (decisions: THINNEST)."""
 
 
 class Surface(NamedTuple):
     """What one view shows.
 
     color: [H, W, 3], blended over black.
-    depth: [H, W] camera z where the transmittance falls to one half, world units; 0 where it does not.
+    depth: [H, W] camera z where the transmittance falls to `transmittance`, world units; 0 where it does not.
     normal: [H, W, 3] unit vectors in the world that face the camera; 0 where nothing is drawn.
     """
 
@@ -51,9 +51,17 @@ class Planes(NamedTuple):
 
 @torch.no_grad()
 def surface(
-    gaussians: Gaussians, camera: Camera, *, antialias: bool = False, backend: ops.Backend | None = None
+    gaussians: Gaussians,
+    camera: Camera,
+    *,
+    transmittance: float = MEDIAN,
+    antialias: bool = False,
+    backend: ops.Backend | None = None,
 ) -> Surface:
-    """The surface of `gaussians` in the view of `camera`, on the backend that `render` takes; without gradients."""
+    """The surface of `gaussians` in the view of `camera`, on the backend that `render` takes; without gradients.
+
+    transmittance: at which a pixel has its depth, 0.1 to 1.
+    """
     width, height = camera.width, camera.height
     viewmat, intrinsics = camera_tensors(camera, gaussians.means)
     projected = ops.project(
@@ -75,7 +83,9 @@ def surface(
     color, _, _ = ops.composite(projected, bins, width, height, backend=backend)
     normals = projected._replace(colors=planes.normals)
     normal, _, _ = ops.composite(normals, bins, width, height, backend=backend)
-    depth = ops.median_depth(projected, bins, width, height, tilts=planes.tilts, backend=backend)
+    depth = ops.median_depth(
+        projected, bins, width, height, tilts=planes.tilts, transmittance=transmittance, backend=backend
+    )
     return Surface(color, depth, torch.nn.functional.normalize(normal, dim=-1, eps=1e-6))
 
 

@@ -19,7 +19,7 @@ def doctor(context: typer.Context) -> None:
 
 
 def bench(context: typer.Context) -> None:
-    """Measure errors and times: kernels, scale, functions, stability, worst, stiffness, sfm, train, live, formats; and
-    the service: soak, load, abuse, capacity, fleet, openapi, fuzz, and their summary."""
+    """Measure errors and times: kernels, scale, functions, stability, worst, stiffness, sfm, train, live, formats,
+    mesh; and the service: soak, load, abuse, capacity, fleet, openapi, fuzz, and their summary."""
     require("splatmill_worker", "`splatmill bench`")
     exec_module("splatmill_worker", "bench", *context.args)

@@ -1,4 +1,4 @@
-// median_depth: the list of each tile front to back, until every pixel has blended half of its light.
+// median_depth: the list of each tile front to back, until every pixel has blended half of its light, or another share.
 #include "blend.hpp"
 #include "composite.hpp"
 #include "rows.hpp"
@@ -7,7 +7,6 @@
 namespace splatmill {
 namespace {
 
-constexpr float kMedian = 0.5f;  // transmittance
 constexpr float kNearestHorizon = 1e-3f;
 
 // The pixels of a block while its tile is walked. A finished pixel has its transmittance negated.
@@ -15,7 +14,7 @@ struct Block {
   alignas(64) float T[kLanes], depth[kLanes];
 };
 
-void median_of_tile(Frame& frame, const float* tilts, const Planes& image, int tile) {
+void depth_of_tile(Frame& frame, const float* tilts, float transmittance, const Planes& image, int tile) {
   const Camera& cam = frame.camera;
   const int columns = cam.columns(), tile_x = tile % columns, tile_y = tile / columns;
   const float x0 = tile_x * kTile + 0.5f, y0 = tile_y * kTile + 0.5f;
@@ -39,13 +38,13 @@ void median_of_tile(Frame& frame, const float* tilts, const Planes& image, int t
       const Float e = log2_alpha(level, form.u_at(b), form.v_at(b));
       const Float alpha = min(exp2_of_alpha(e), kAlphaMax);
       const Float T = load(block.T), T_after = fnma(alpha, T, T);
-      const Mask open = T > 0.0f, hit = open & (e >= kLog2AlphaMin), half = hit & (T_after <= kMedian);
-      // Before half is blended, no splat can end the pixel: 0.5 (1 - 0.999) is above the least transmittance.
+      const Mask open = T > 0.0f, hit = open & (e >= kLog2AlphaMin), passed = hit & (T_after <= transmittance);
+      // Before that, no splat can end the pixel: a tenth of the light, times 1 - 0.999, is the least transmittance.
       const Float dx = lanes.pixel_x + (x0 + b % kBlocksAcross * kBlockSide - r.x);
       const Float dy = lanes.pixel_y + (y0 + b / kBlocksAcross * kBlockSide - r.y);
       const Float nearness = fnma(dy, splat(tilt[1]), fnma(dx, splat(tilt[0]), splat(1.0f)));
-      store(block.depth, select(half & (nearness > kNearestHorizon), splat(r.depth) / nearness, load(block.depth)));
-      const Float left_over = mark(half, select(hit, T_after, T));
+      store(block.depth, select(passed & (nearness > kNearestHorizon), splat(r.depth) / nearness, load(block.depth)));
+      const Float left_over = mark(passed, select(hit, T_after, T));
       store(block.T, left_over);
       if (all(left_over < 0.0f)) live &= ~(1u << b);
     }
@@ -60,8 +59,8 @@ void bind_median_depth(nb::module_& m) {
   m.def(
       "median_depth",
       [](Frame& frame, Rows<2> means2d, Rows<3> conics, Row opacities, Rows<3> colors, Row depths, Rows<2> extents,
-         Rows<2> tilts, Tensor<int64_t, nb::ndim<1>> offsets, Tensor<int32_t, nb::ndim<1>> ids, int width, int height,
-         Image image, int threads) {
+         Rows<2> tilts, float transmittance, Tensor<int64_t, nb::ndim<1>> offsets, Tensor<int32_t, nb::ndim<1>> ids,
+         int width, int height, Image image, int threads) {
         const ProjectedRows rows{means2d.data(), conics.data(), opacities.data(), colors.data(), depths.data(), extents.data()};
         nb::gil_scoped_release release;
         frame.camera = Camera{};
@@ -74,13 +73,13 @@ void bind_median_depth(nb::module_& m) {
         {
           const FlushDenormals flush;
 #pragma omp for schedule(dynamic, 2)
-          for (int tile = 0; tile < tiles; ++tile) median_of_tile(frame, tilts.data(), plane, tile);
+          for (int tile = 0; tile < tiles; ++tile) depth_of_tile(frame, tilts.data(), transmittance, plane, tile);
         }
       },
       "frame"_a, "means2d"_a.noconvert(), "conics"_a.noconvert(), "opacities"_a.noconvert(), "colors"_a.noconvert(),
-      "depths"_a.noconvert(), "extents"_a.noconvert(), "tilts"_a.noconvert(), "offsets"_a.noconvert(), "ids"_a.noconvert(),
+      "depths"_a.noconvert(), "extents"_a.noconvert(), "tilts"_a.noconvert(), "transmittance"_a, "offsets"_a.noconvert(), "ids"_a.noconvert(),
       "width"_a, "height"_a, "image"_a.noconvert(), "threads"_a,
-      "Writes to one plane the depth at which the transmittance of each pixel falls to one half, and 0 where it stays above.");
+      "Writes to one plane the depth at which the transmittance of each pixel falls to the one given, and 0 where it stays above.");
 }
 
 }  // namespace splatmill

@@ -10,7 +10,9 @@ from . import engine
 from .composite import empty_planes
 
 
-def median_depth(projected: Projected, bins: Bins, width: int, height: int, *, tilts: Tensor) -> Tensor:
+def median_depth(
+    projected: Projected, bins: Bins, width: int, height: int, *, tilts: Tensor, transmittance: float
+) -> Tensor:
     """Return the median depth [H,W], as `reference.median_depth` defines it."""
     rows = [x.detach().contiguous() for x in projected]
     image = empty_planes(1, width, height)
@@ -18,6 +20,7 @@ def median_depth(projected: Projected, bins: Bins, width: int, height: int, *, t
         engine.Frame(),
         *rows,
         tilts.detach().contiguous(),
+        transmittance,
         bins.offsets.contiguous(),
         bins.ids.contiguous(),
         width,

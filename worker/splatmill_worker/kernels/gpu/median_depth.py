@@ -7,20 +7,20 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from ..records import MEDIAN, NEAREST_HORIZON, TILE, Bins, Projected
+from ..records import NEAREST_HORIZON, TILE, Bins, Projected
 from . import device, record
-from .argument import Floats, Int, Ints, Longs
+from .argument import Float, Floats, Int, Ints, Longs
 from .blend import LEAST, MOST, PIXELS, along_factor, raw_alpha, tile_pixels
 from .constant import constant
 from .record import DEPTH, FACTOR_UX, FACTOR_UY, FACTOR_VY, LEVEL, MEAN_X, MEAN_Y, STRIDE
 
-HALF = constant(MEDIAN)
 HORIZON = constant(NEAREST_HORIZON)
 
 
 @triton.jit
 def median_depth_kernel(
-    records: Floats, tilts: Floats, offsets: Longs, ids: Ints, depth: Floats, width: Int, height: Int, columns: Int
+    records: Floats, tilts: Floats, offsets: Longs, ids: Ints, depth: Floats, transmittance: Float,
+    width: Int, height: Int, columns: Int,
 ):  # fmt: skip
     """Write the median depth of one tile's pixels. A finished pixel has a transmittance of 0."""
     tile = tl.program_id(0)
@@ -45,23 +45,26 @@ def median_depth_kernel(
         alpha = tl.minimum(raw_alpha(u, v, tl.load(source + LEVEL)), MOST)
         after = through - alpha * through
         shown = (alpha >= LEAST) & (through > 0.0)
-        half = shown & (after <= HALF)
+        passed = shown & (after <= transmittance)
         nearness = 1.0 - dx * tl.load(tilts + splat * 2) - dy * tl.load(tilts + splat * 2 + 1)
-        deep = tl.where(half & (nearness > HORIZON), tl.load(source + DEPTH) / nearness, deep)
-        through = tl.where(half, 0.0, tl.where(shown, after, through))
+        deep = tl.where(passed & (nearness > HORIZON), tl.load(source + DEPTH) / nearness, deep)
+        through = tl.where(passed, 0.0, tl.where(shown, after, through))
         most = tl.max(through, 0)
         done += 1
     tl.store(depth + row * width + column, deep, mask=inside)
 
 
 @torch.no_grad()
-def median_depth(projected: Projected, bins: Bins, width: int, height: int, *, tilts: Tensor) -> Tensor:
+def median_depth(
+    projected: Projected, bins: Bins, width: int, height: int, *, tilts: Tensor, transmittance: float
+) -> Tensor:
     """Return the median depth [H,W], as `reference.median_depth` defines it."""
     device.require(projected.means2d)
     columns, rows = -(-width // TILE), -(-height // TILE)
     depth = torch.empty(height, width, device=projected.means2d.device, dtype=torch.float32)
     median_depth_kernel[(columns * rows,)](
-        record.pack(projected), tilts.contiguous(), bins.offsets, bins.ids, depth, width, height, columns,
+        record.pack(projected), tilts.contiguous(), bins.offsets, bins.ids, depth, float(transmittance), width, height,
+        columns,
         num_warps=2,
     )  # fmt: skip
     return depth

@@ -1,17 +1,19 @@
-"""Depth of the Gaussian at which the transmittance of a pixel falls to one half."""
+"""Depth of the Gaussian at which the transmittance of a pixel falls to one half, or to another value."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from ..records import MEDIAN, NEAREST_HORIZON, TILE, Bins, Projected
+from ..records import NEAREST_HORIZON, TILE, Bins, Projected
 from .composite import _weights
 
 
 @torch.no_grad()
-def median_depth(projected: Projected, bins: Bins, width: int, height: int, *, tilts: Tensor) -> Tensor:
-    """Return the median depth [H,W]: z where the first splat leaves a transmittance of 1/2 or less, else 0.
+def median_depth(
+    projected: Projected, bins: Bins, width: int, height: int, *, tilts: Tensor, transmittance: float
+) -> Tensor:
+    """Return the median depth [H,W]: z where the first splat leaves that transmittance or less, else 0.
 
     Splats are blended as by `composite`. With d from a splat's mean2d to the pixel centre, z = depth / (1 - tilt . d),
     as on a plane. Where 1 - tilt . d is not above NEAREST_HORIZON, the pixel has no depth.
@@ -26,7 +28,7 @@ def median_depth(projected: Projected, bins: Bins, width: int, height: int, *, t
         top, left = tile // columns * TILE, tile % columns * TILE
         h, w = min(TILE, height - top), min(TILE, width - left)
         weights = _weights(projected, ids, left, top, w, h, False)
-        crossed = 1.0 - weights.cumsum(1) <= MEDIAN
+        crossed = 1.0 - weights.cumsum(1) <= transmittance
         first = crossed.to(torch.uint8).argmax(1)
         splat = ids[first]
         y, x = torch.meshgrid(

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +17,9 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from splatmill.files import replacing
 from splatmill_worker.errors import ModelUnreadable
 from splatmill_worker.readers.reader_memory import check, check_gaussians
+from splatmill_worker.splat.formats import gltf
 from splatmill_worker.splat.formats.contents import (
     NO_OFFSET,
     Contents,
@@ -39,18 +38,7 @@ EXTENSION = "KHR_gaussian_splatting"
 MAX_JSON_BYTES = 2**22
 """Bytes of the document, which has some ten kilobytes; Python takes up to thirty times as many to parse it."""
 
-_MAGIC, _VERSION, _JSON, _BIN = b"glTF", 2, b"JSON", b"BIN\0"
-_ARRAY_BUFFER, _POINTS = 34962, 0
-_TYPES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
-_COMPONENTS: dict[int, tuple[str, float]] = {
-    5120: ("<i1", 127),
-    5121: ("<u1", 255),
-    5122: ("<i2", 32767),
-    5123: ("<u2", 65535),
-    5126: ("<f4", 1),
-}
-"""Component types of the attributes: numpy's name, and what a normalized value is divided by."""
-
+_POINTS = 0
 Array = npt.NDArray[np.generic]
 
 
@@ -62,16 +50,16 @@ def write(path: Path, gaussians: Gaussians, *, offset: Offset = NO_OFFSET, antia
     `extras` of the primitive. The file is replaced atomically and synced. Raises ValueError for 4 GiB or more.
     """
     turned = turned_about_x(visible(gaussians))
-    parts = _Parts()
+    parts = gltf.Parts()
     attributes = {
-        "POSITION": parts.add(turned.means, bounds=True),
+        "POSITION": parts.add(turned.means.numpy(), bounds=True),
         "COLOR_0": parts.add(_point_colors(turned), normalized=True),
-        f"{EXTENSION}:ROTATION": parts.add(unit(turned.quats).roll(-1, 1)),
-        f"{EXTENSION}:SCALE": parts.add(turned.log_scales.exp()),
-        f"{EXTENSION}:OPACITY": parts.add(torch.sigmoid(turned.logit_opacities)[:, None]),
+        f"{EXTENSION}:ROTATION": parts.add(unit(turned.quats).roll(-1, 1).numpy()),
+        f"{EXTENSION}:SCALE": parts.add(turned.log_scales.exp().numpy()),
+        f"{EXTENSION}:OPACITY": parts.add(torch.sigmoid(turned.logit_opacities)[:, None].numpy()),
     }
     for index, (degree, order) in enumerate(_harmonics(turned.degree)):
-        attributes[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{order}"] = parts.add(turned.sh[:, index])
+        attributes[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{order}"] = parts.add(turned.sh[:, index].numpy())
     extension = {
         "kernel": "ellipse",
         "colorSpace": "srgb_rec709_display",
@@ -85,31 +73,14 @@ def write(path: Path, gaussians: Gaussians, *, offset: Offset = NO_OFFSET, antia
         "extras": {"antialiased": antialiased} | ({"offset": offset} if any(offset) else {}),
     }
     document: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": "Splatmill"},
+        "asset": gltf.ASSET,
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0] if turned.count else []}],
     }
     if turned.count:  # glTF has no accessors of nothing
-        document |= {
-            "nodes": [{"mesh": 0}],
-            "meshes": [{"primitives": [primitive]}],
-            "accessors": parts.accessors,
-            "bufferViews": parts.views,
-            "buffers": [{"byteLength": parts.length}],
-        }
-    text = json.dumps(document, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
-    total = 12 + 8 + len(text) + (8 + parts.length if turned.count else 0)
-    if total >= 2**32:
-        raise ValueError(f"{turned.count} Gaussians take {total} bytes, and a .glb holds less than 4 GiB.")
-    with replacing(path, sync=True) as part, part.open("wb") as stream:
-        stream.write(struct.pack("<4sII", _MAGIC, _VERSION, total))
-        stream.write(struct.pack("<I4s", len(text), _JSON) + text)
-        if turned.count:
-            stream.write(struct.pack("<I4s", parts.length, _BIN))
-            for array in parts.arrays:
-                stream.write(array.tobytes())
+        document |= {"nodes": [{"mesh": 0}], "meshes": [{"primitives": [primitive]}]} | parts.document()
+    gltf.write(path, document, parts if turned.count else None, f"{turned.count} Gaussians")
     return turned.count
 
 
@@ -138,38 +109,6 @@ def read(path: Path) -> Contents:
         ) from error
 
 
-@dataclass
-class _Parts:
-    """The binary chunk, an array for each accessor, with what the document says of them."""
-
-    arrays: list[npt.NDArray[np.generic]] = field(default_factory=list)
-    views: list[dict[str, Any]] = field(default_factory=list)
-    accessors: list[dict[str, Any]] = field(default_factory=list)
-    length: int = 0
-
-    def add(self, values: Tensor, *, bounds: bool = False, normalized: bool = False) -> int:
-        """Append [N, 1, 3 or 4] values, float32 or uint8 in fours, and return the index of their accessor."""
-        array = np.ascontiguousarray(values.numpy())
-        kind = {"float32": 5126, "uint8": 5121}[array.dtype.name]
-        accessor: dict[str, Any] = {
-            "bufferView": len(self.views),
-            "componentType": kind,
-            "count": array.shape[0],
-            "type": {width: name for name, width in _TYPES.items()}[array.shape[1]],
-        }
-        if normalized:
-            accessor["normalized"] = True
-        if bounds and array.shape[0]:
-            accessor |= {"min": array.min(0).tolist(), "max": array.max(0).tolist()}
-        self.views.append(
-            {"buffer": 0, "byteOffset": self.length, "byteLength": array.nbytes, "target": _ARRAY_BUFFER}
-        )
-        self.accessors.append(accessor)
-        self.arrays.append(array)
-        self.length += array.nbytes  # a multiple of four, as glTF asks for
-        return len(self.accessors) - 1
-
-
 def _harmonics(degree: int) -> Iterator[tuple[int, int]]:
     """Degree of each coefficient in the order of the `.ply`, and its place within it, from the lowest order up."""
     for each in range(degree + 1):
@@ -177,12 +116,11 @@ def _harmonics(degree: int) -> Iterator[tuple[int, int]]:
             yield each, order
 
 
-def _point_colors(gaussians: Gaussians) -> Tensor:
+def _point_colors(gaussians: Gaussians) -> Array:
     """Linear colour and opacity as bytes [N, 4]: COLOR_0 is linear, and the harmonics give sRGB values."""
-    shown = (0.5 + SH_C0 * gaussians.sh[:, 0]).clamp(0, 1)
-    linear = torch.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
-    alpha = torch.sigmoid(gaussians.logit_opacities)[:, None]
-    return (torch.cat([linear, alpha], 1) * 255).round().to(torch.uint8)
+    shown = (0.5 + SH_C0 * gaussians.sh[:, 0]).clamp(0, 1).numpy()
+    alpha = torch.sigmoid(gaussians.logit_opacities)[:, None].numpy()
+    return (np.concatenate([gltf.linear(shown), alpha], 1) * 255).round().astype(np.uint8)
 
 
 def _contents(path: Path) -> Contents:
@@ -242,12 +180,12 @@ def _chunks(path: Path) -> tuple[dict[str, Any], bytes]:
     """The document and the binary chunk. Raises ValueError for files that are no binary glTF 2.0."""
     with path.open("rb") as file:
         magic, version, total = struct.unpack("<4sII", file.read(12))
-        if magic != _MAGIC or version != _VERSION:
-            raise ValueError(f"it does not begin as binary glTF {_VERSION}")
+        if magic != gltf.MAGIC or version != gltf.VERSION:
+            raise ValueError(f"it does not begin as binary glTF {gltf.VERSION}")
         if total > path.stat().st_size:
             raise ValueError(f"its header announces {total} bytes, and it has {path.stat().st_size}")
         length, kind = struct.unpack("<I4s", file.read(8))
-        if kind != _JSON or length > min(total, MAX_JSON_BYTES):
+        if kind != gltf.JSON or length > min(total, MAX_JSON_BYTES):
             raise ValueError("its first chunk is no JSON document of a plausible size")
         document = json.loads(file.read(length))
         if not isinstance(document, dict):
@@ -256,7 +194,7 @@ def _chunks(path: Path) -> tuple[dict[str, Any], bytes]:
         if not head:
             return document, b""
         length, kind = struct.unpack("<I4s", head)
-        if kind != _BIN or length > total:
+        if kind != gltf.BIN or length > total:
             raise ValueError("its second chunk is not its binary data")
         check("reading it", length, total)
         data = file.read(length)
@@ -291,12 +229,12 @@ def _accessor(
     accessor = document["accessors"][index]
     if accessor["count"] != expected:
         raise ValueError(f"{name} has {accessor['count']!r:.20} values, and POSITION {expected!r:.20}")
-    if accessor.get("sparse") is not None or _TYPES.get(accessor["type"]) != width:
+    if accessor.get("sparse") is not None or gltf.TYPES.get(accessor["type"]) != width:
         raise ValueError(f"the accessor of {name} is sparse or no {width} values")
     view = document["bufferViews"][accessor["bufferView"]]
     if view.get("buffer") != 0 or "uri" in document["buffers"][0]:
         raise ValueError(f"the values of {name} are not in the file itself")
-    kind, divisor = _COMPONENTS[accessor["componentType"]]
+    kind, divisor = gltf.COMPONENTS[accessor["componentType"]]
     row = np.dtype((kind, (width,)))
     count, stride = accessor["count"], view.get("byteStride", row.itemsize)
     begin = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)

@@ -1,0 +1,51 @@
+"""Proves what `splatmill mesh` asks of its arguments, and that it hands them to the worker's program.
+
+What the program makes is proved in tests/worker/render_service/test_mesh.py.
+"""
+
+from pathlib import Path
+
+import pytest
+
+from tests.support.ball import write_ply
+from tests.support.command_line import invoke, spawn
+
+
+@pytest.fixture
+def ball(tmp_path: Path) -> Path:
+    write_ply(tmp_path / "ball.ply", 500)
+    return tmp_path / "ball.ply"
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["-o", "out.obj"], "out.obj must end in one of .glb, .ply"),
+        (["--cameras", "absent.json"], "There is no file absent.json"),
+        (["--box", "0", "0", "0", "0", "1", "1"], "The box is empty"),
+        (["--faces", "3"], "Invalid value for '--faces'"),
+        (["--voxel", "0"], "Invalid value for '--voxel'"),
+    ],
+)
+def test_what_cannot_be_done_is_said_before_anything_runs(ball: Path, options: list[str], said: str) -> None:
+    ran = invoke("mesh", str(ball), *options)
+    assert ran.exit_code != 0
+    assert said in " ".join(ran.output.replace("│", " ").split())
+
+
+def test_a_file_that_is_no_model_is_named(tmp_path: Path) -> None:
+    assert "There is no file" in invoke("mesh", str(tmp_path / "none.ply")).output
+    (tmp_path / "photo.jpg").write_bytes(b"")
+    assert "must end in one of" in invoke("mesh", str(tmp_path / "photo.jpg")).output
+
+
+@pytest.mark.slow
+def test_the_program_gets_the_options_and_its_refusal_is_shown(ball: Path) -> None:
+    out = ball.with_name("mesh.ply")
+    cameras = ball.with_name("cameras.json")
+    cameras.write_text("{}")
+    process = spawn("mesh", ball, "-o", out, "--cameras", cameras, "--box", "0", "0", "0", "1", "1", "1")
+    _, stderr = process.communicate(timeout=120)
+    assert process.returncode == 5
+    assert "is not the cameras.json of a model" in stderr
+    assert not out.exists()

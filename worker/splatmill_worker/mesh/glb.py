@@ -1,0 +1,47 @@
+"""Meshes as `.glb`: one primitive of triangles with a colour at each vertex, which programs show without light.
+
+The light of the photos is in the colours already, hence KHR_materials_unlit. glTF has y up: the mesh is turned about x
+by 180 degrees, as the `.glb` of its model is.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from splatmill_worker.mesh.triangles import Mesh
+from splatmill_worker.splat.formats import gltf
+
+UNLIT = "KHR_materials_unlit"
+_TRIANGLES = 4
+
+
+def write(path: Path, mesh: Mesh, offset: tuple[float, float, float]) -> None:
+    """Write a mesh. offset: world = mesh + offset, in the `extras` of the primitive where it is not 0."""
+    parts = gltf.Parts()
+    attributes = {"POSITION": parts.add(mesh.vertices * np.array([1, -1, -1], np.float32), bounds=True)}
+    if mesh.colors is not None:
+        light = gltf.linear(mesh.colors / 255.0)
+        opaque = np.concatenate([light, np.ones((len(light), 1))], 1)
+        attributes["COLOR_0"] = parts.add((opaque * 65535).round().astype(np.uint16), normalized=True)
+    primitive: dict[str, Any] = {
+        "mode": _TRIANGLES,
+        "attributes": attributes,
+        "indices": parts.add(mesh.faces.reshape(-1, 1).astype(np.uint32), indices=True),
+        "material": 0,
+    }
+    if any(offset):
+        primitive["extras"] = {"offset": offset}
+    surface = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+    document = {
+        "asset": gltf.ASSET,
+        "extensionsUsed": [UNLIT],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive]}],
+        "materials": [{"pbrMetallicRoughness": surface, "doubleSided": True, "extensions": {UNLIT: {}}}],
+    }
+    gltf.write(path, document | parts.document(), parts, f"{len(mesh.faces)} triangles")

@@ -1,0 +1,140 @@
+"""Meshes of a model file, without a server: the program `mesh-file`; and the cameras that a mesh is made from."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from splatmill.backplane.storage.records import reason
+from splatmill.schema import Box, ModelCameras, OrbitRequest
+from splatmill_worker.errors import ModelUnreadable, Refusal
+from splatmill_worker.mesh import glb, ply
+from splatmill_worker.mesh.build import Built, NoSurface, Wanted, build
+from splatmill_worker.mesh.fusion import TooLarge
+from splatmill_worker.mesh.triangles import Mesh
+from splatmill_worker.render_service.encoding import camera_of
+from splatmill_worker.render_service.local import AXES, REFUSED, STOPPED, UNWRITABLE, read
+from splatmill_worker.render_service.orbit import DEFAULT_FOV, UP, Float, cameras_along, path_of
+from splatmill_worker.scene import Camera
+from splatmill_worker.splat.gaussians import Gaussians
+
+RINGS = (-0.2, 0.35, 1.1)
+"""Heights of the rings of cameras around a model without cameras, in radii of the lowest."""
+
+RING = OrbitRequest(seconds=1.0, fps=24, width=800, height=600)
+"""The cameras of one ring: their number and size."""
+
+SAY_EVERY = 2.0  # seconds between two lines about the progress
+
+
+def main(chosen: argparse.Namespace) -> int:
+    """Run `mesh-file` with its parsed arguments; return the exit status."""
+    box = None if chosen.box is None else Box.model_validate_json(chosen.box)
+    wanted = Wanted(chosen.faces, chosen.voxel, None if box is None else (box.min, box.max))
+    try:
+        built = mesh_file(chosen.model, chosen.out, wanted, chosen.cameras, chosen.up)
+    except (ModelUnreadable, Refusal) as error:
+        print(f"Error: {error.message}", file=sys.stderr)
+        return REFUSED
+    except OSError as error:
+        print(f"Error: {error.filename or chosen.out}: {error.strerror or error}.", file=sys.stderr)
+        return UNWRITABLE
+    except KeyboardInterrupt:
+        print("Stopped; nothing was written.", file=sys.stderr)
+        return STOPPED
+    mesh = built.mesh
+    print(
+        f"{len(mesh.faces):,} triangles and {len(mesh.vertices):,} vertices from {built.views} views; voxels of "
+        f"{built.voxel:.4g}, {built.extracted:,} triangles before simplification."
+    )
+    print(chosen.out)
+    return 0
+
+
+def mesh_file(model: Path, out: Path, wanted: Wanted, cameras: Path | None, up: str) -> Built:
+    """Write the mesh of the model file `model` to `out`, a `.glb` or a `.ply`.
+
+    cameras: a cameras.json; None takes the one beside the model or, where there is none, rings of cameras around it.
+    up: the axis that points up in a model without cameras, a key of AXES.
+
+    Raises ModelUnreadable, Refusal where the cameras cannot be used or nothing is found, and OSError.
+    """
+    contents = read(model)
+    path = cameras or model.with_name("cameras.json")
+    stored = _stored(path) if cameras is not None or path.is_file() else None
+    every = cameras_for(stored, contents.gaussians, AXES[up])
+    built = built_or_refused(contents.gaussians, every, wanted, bool(contents.antialiased), _Lines().told)
+    write(out, built.mesh, contents.offset)
+    return built
+
+
+def built_or_refused(
+    gaussians: Gaussians, cameras: list[Camera], wanted: Wanted, antialias: bool, told: Callable[[str], None]
+) -> Built:
+    """The mesh of a model. Raises Refusal where the cameras agree on no surface, and where voxels are too small."""
+    try:
+        return build(gaussians, cameras, wanted, antialias=antialias, told=told)
+    except NoSurface as error:
+        raise Refusal(
+            "option_out_of_range",
+            "No two cameras agree on a surface of this model. Check that the cameras are those of the model, and that "
+            "the box holds a part of it.",
+        ) from error
+    except TooLarge as error:
+        raise Refusal("option_out_of_range", f"{error} Choose larger voxels or a box.") from error
+
+
+def cameras_for(stored: ModelCameras | None, gaussians: Gaussians, up: Float = UP) -> list[Camera]:
+    """The cameras of the model's photos; where there are fewer than two, rings of cameras around its dense middle."""
+    if stored is not None and len(stored.cameras) > 1:
+        return [camera_of(row.camera) for row in stored.cameras]
+    return list(_rings(gaussians, up))
+
+
+def write(out: Path, mesh: Mesh, offset: tuple[float, float, float]) -> None:
+    """Write a mesh in the format of the suffix. offset: world = model + offset."""
+    if out.suffix.lower() == ".glb":
+        glb.write(out, mesh, offset)
+        return
+    comments = ["Made by Splatmill"]
+    if any(offset):
+        comments.append("offset " + " ".join(f"{value:.0f}" for value in offset))
+    ply.write(out, mesh.vertices, mesh.faces, mesh.colors, tuple(comments))
+
+
+def _rings(gaussians: Gaussians, up: Float) -> Iterable[Camera]:
+    path = path_of(gaussians, up)
+    for height in RINGS:
+        shape = replace(
+            path, height=height * path.radius, radius=path.radius / math.sqrt(1.0 + max(0.0, height) ** 2)
+        )
+        yield from cameras_along(shape, RING, DEFAULT_FOV)
+
+
+def _stored(path: Path) -> ModelCameras:
+    try:
+        return ModelCameras.model_validate_json(path.read_bytes())
+    except ValidationError as error:
+        raise Refusal(
+            "poses_invalid",
+            f"{path} is not the cameras.json of a model: {reason(error)}. Download it with the model.",
+        ) from error
+
+
+class _Lines:
+    """Prints what is being done, a line every SAY_EVERY seconds."""
+
+    def __init__(self) -> None:
+        self._said = time.monotonic()
+
+    def told(self, stage: str) -> None:
+        if time.monotonic() - self._said > SAY_EVERY:
+            self._said = time.monotonic()
+            print(stage, flush=True)

@@ -1,0 +1,103 @@
+"""Writes binary glTF 2.0: the document, and one buffer with an array for each accessor.
+
+Source: Khronos, glTF 2.0, section 4.4 (binary files).
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from splatmill.files import replacing
+
+MAGIC, VERSION, JSON, BIN = b"glTF", 2, b"JSON", b"BIN\0"
+ASSET = {"version": "2.0", "generator": "Splatmill"}
+TYPES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+COMPONENTS: dict[int, tuple[str, float]] = {
+    5120: ("<i1", 127),
+    5121: ("<u1", 255),
+    5122: ("<i2", 32767),
+    5123: ("<u2", 65535),
+    5126: ("<f4", 1),
+}
+"""Component types of attributes: numpy's name, and what a normalized value is divided by."""
+
+_ATTRIBUTES, _INDICES = 34962, 34963
+_KINDS = {"float32": 5126, "uint8": 5121, "uint16": 5123, "uint32": 5125}
+
+
+@dataclass
+class Parts:
+    """The binary chunk, an array for each accessor, with what the document says of them."""
+
+    arrays: list[npt.NDArray[np.generic]] = field(default_factory=list)
+    views: list[dict[str, Any]] = field(default_factory=list)
+    accessors: list[dict[str, Any]] = field(default_factory=list)
+    length: int = 0
+
+    def add(
+        self,
+        values: npt.NDArray[Any],
+        *,
+        bounds: bool = False,
+        normalized: bool = False,
+        indices: bool = False,
+    ) -> int:
+        """Append [N, 1, 3 or 4] values, in rows of a multiple of four bytes, and return their accessor's index."""
+        array = np.ascontiguousarray(values)
+        accessor: dict[str, Any] = {
+            "bufferView": len(self.views),
+            "componentType": _KINDS[array.dtype.name],
+            "count": array.shape[0],
+            "type": {width: name for name, width in TYPES.items()}[array.shape[1]],
+        }
+        if normalized:
+            accessor["normalized"] = True
+        if bounds and array.shape[0]:
+            accessor |= {"min": array.min(0).tolist(), "max": array.max(0).tolist()}
+        target = _INDICES if indices else _ATTRIBUTES
+        self.views.append(
+            {"buffer": 0, "byteOffset": self.length, "byteLength": array.nbytes, "target": target}
+        )
+        self.accessors.append(accessor)
+        self.arrays.append(array)
+        self.length += array.nbytes  # a multiple of four, as glTF asks for
+        return len(self.accessors) - 1
+
+    def document(self) -> dict[str, Any]:
+        """The members of a document that describe the parts."""
+        return {
+            "accessors": self.accessors,
+            "bufferViews": self.views,
+            "buffers": [{"byteLength": self.length}],
+        }
+
+
+def write(path: Path, document: dict[str, Any], parts: Parts | None, what: str) -> None:
+    """Write a document with its parts, if it has any. The file is replaced atomically and synced.
+
+    what: the contents for an error. Raises ValueError for 4 GiB or more.
+    """
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    total = 12 + 8 + len(text) + (8 + parts.length if parts else 0)
+    if total >= 2**32:
+        raise ValueError(f"{what} take {total} bytes, and a .glb holds less than 4 GiB.")
+    with replacing(path, sync=True) as part, part.open("wb") as stream:
+        stream.write(struct.pack("<4sII", MAGIC, VERSION, total))
+        stream.write(struct.pack("<I4s", len(text), JSON) + text)
+        if parts:
+            stream.write(struct.pack("<I4s", parts.length, BIN))
+            for array in parts.arrays:
+                stream.write(array.tobytes())
+
+
+def linear(shown: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.floating[Any]]:
+    """Linear light of sRGB values from 0 to 1: what COLOR_0 holds."""
+    return np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
