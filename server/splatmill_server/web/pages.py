@@ -66,6 +66,12 @@ def model_page(request: Request, model_id: str) -> Response:
     return page(request, "model/model.html")
 
 
+@router.api_route("/compare", methods=_METHODS)
+def compare_page(request: Request) -> Response:
+    """Two models side by side."""
+    return page(request, "beside/beside.html")
+
+
 @router.api_route("/open", methods=_METHODS)
 def open_page(request: Request) -> Response:
     """The viewer for a model file of the visitor's own, which is not sent to the server."""

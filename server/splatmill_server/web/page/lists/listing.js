@@ -15,9 +15,10 @@ const TYPING_MS = 250; // a pause in typing after which the list is asked for ag
  * @param {() => (Node | string)} list.empty what to say where there is nothing at all
  * @param {(records: any[]) => Promise<unknown>} list.deleteAll deletes the records that were selected
  * @param {(record: any) => boolean} [list.deletable] whether a record can be selected
+ * @param {(ids: string[]) => void} [list.compare] shows two records beside each other
  * @returns {Promise<{reload: () => Promise<void>, remove: (id: string) => void, update: (record: any) => void, records: () => any[]}>}
  */
-export async function listing({ noun, limit, query, entry, empty, deleteAll, deletable = () => true }) {
+export async function listing({ noun, limit, query, entry, empty, deleteAll, deletable = () => true, compare }) {
   const form = /** @type {HTMLFormElement} */ (byId("filters"));
   const box = byId("list");
   const more = /** @type {HTMLButtonElement} */ (byId("more"));
@@ -45,17 +46,20 @@ export async function listing({ noun, limit, query, entry, empty, deleteAll, del
     saySelected();
     await deleteAll(chosen);
   } });
+  const compareSelected = h("button", { type: "button", disabled: true, hidden: true, title: "Two of them", onclick: () => compare?.([...selected]) }, "Compare");
   const selecting = toggle("Select", (on) => {
     selected.clear();
     box.classList.toggle("selecting", on);
     for (const check of box.querySelectorAll(".select input")) /** @type {HTMLInputElement} */ (check).checked = false;
     deleteSelected.hidden = !on;
+    compareSelected.hidden = !on || !compare;
     saySelected();
   });
-  form.append(h("div", { class: "row push" }, deleteSelected, selecting));
+  form.append(h("div", { class: "row push" }, compareSelected, deleteSelected, selecting));
 
   function saySelected() {
     deleteSelected.disabled = selected.size === 0;
+    compareSelected.disabled = selected.size !== 2;
     deleteSelected.textContent = selected.size ? `Delete ${selected.size} selected` : "Delete selected";
   }
 

@@ -1,5 +1,6 @@
 // The list of models with their pictures, and what they occupy in storage.
 
+import { at } from "../address.js";
 import { get, modelAddress } from "../api.js";
 import { putInBin } from "../bin.js";
 import { append, byId, h } from "../dom.js";
@@ -124,6 +125,7 @@ const list = await listing({
   query: ({ name }) => ({ name }),
   entry,
   deleteAll: removeAll,
+  compare: ([left, right]) => location.assign(at(`/compare?${new URLSearchParams({ left, right })}`)),
   empty: () => h("div", {}, h("p", {}, "There are no models yet. ", h("a", { href: "/" }, "Start with some photos"), "."), exampleOffer()),
 });
 await stored();
