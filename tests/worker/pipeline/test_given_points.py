@@ -49,7 +49,7 @@ def test_points_of_a_scan_come_beside_those_of_the_photos(name: str, capture: Pa
     (write_las if name.endswith("z") else write_ply)(capture / "poses" / name, points, colors)
     poses = json.loads((capture / "poses" / "transforms.json").read_text())
     (capture / "poses" / "transforms.json").write_text(json.dumps({**poses, "ply_file_path": "own.ply"}))
-    write_ply(capture / "poses" / "own.ply", points[:100] + (0, 0, 1e-3), colors[:100])
+    write_ply(capture / "poses" / "own.ply", points[:100] + np.array((0, 0, 1e-3)), colors[:100])
     scene = load(capture, tmp_path, name)
     assert scene.facts["given_points"] == len(points)
     used = scene.facts["given_points_used"]
