@@ -79,6 +79,10 @@ CONFIGURATIONS = {
     "late-fall": Configuration(
         "rates fall after 60 % of the budget, however few the photos", plan={"schedule.annealing.hold": 0.6}
     ),
+    "not-ended": Configuration(
+        "few photos from one side are trained to the end of the budget",
+        instead={"splatmill_worker.splat.plan.capacity.most_steps": "no_most_steps"},
+    ),
     "long-average": Configuration(
         "squared gradients averaged over a thousand steps", plan={"schedule.annealing.beta2": 0.999}
     ),

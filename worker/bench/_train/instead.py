@@ -12,12 +12,14 @@ from unittest.mock import patch
 
 import torch
 
+from splatmill.schema import TrainOptions
 from splatmill_worker.sfm.run import EffortResult, SfmRun
 from splatmill_worker.splat.cleaning import clean
 from splatmill_worker.splat.engine.open import gaussians_of
 from splatmill_worker.splat.engine.protocol import Engine
 from splatmill_worker.splat.evaluate import evaluate
 from splatmill_worker.splat.gaussians import Gaussians
+from splatmill_worker.splat.plan.facts import Facts
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.train.disagreement import Disagreement, disagreements
 from splatmill_worker.splat.train.evaluations import finally_evaluated
@@ -42,6 +44,11 @@ def applied(functions: dict[str, str]) -> Iterator[None]:
 def not_grown(first: Gaussians, count: int) -> Gaussians:
     """In place of `probe.grown`: the Gaussians of the start, whatever `count` is."""
     return first.padded(3)
+
+
+def no_most_steps(facts: Facts, options: TrainOptions) -> int | None:
+    """In place of `capacity.most_steps`: the budget alone ends the training."""
+    return None
 
 
 def left_folded(run: SfmRun, result: EffortResult) -> None:

@@ -71,7 +71,7 @@ def budgets(timed: list[Row]) -> str:
         spent = Spread.of(row["seconds"]["train"] for row in group)
         quality = Spread.of(row["psnr"] for row in group)
         off = max(abs(spent.least - seconds), abs(spent.largest - seconds)) / seconds
-        early = any("held-out" in row["stopped"] for row in group)
+        early = any(not row["stopped"].startswith("the budget is spent") for row in group)
         if off > TOLERANCE and not early:
             late.append(f"{scene} at {budget} is {100 * off:.1f} % off")
         busy += [f"{scene} at {budget}, seed {row['seed']}" for row in group if disturbed(row)]

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import pytest
 
+from splatmill_worker.splat.plan.budget import Budget
 from splatmill_worker.splat.plan.facts import Speed
 from splatmill_worker.splat.plan.plan import Plan
 from tests.support.facts import changed, planned
@@ -49,6 +50,30 @@ def test_only_a_preset_that_photos_judge_is_doubled() -> None:
         few.reasons["budget"] == "No budget was given; for 11 photos, the preset balanced allows 3000 steps."
     )
     assert planned(changed(views=11), target_psnr=30.0).schedule.longest == 40_000
+
+
+def test_few_photos_from_one_side_end_a_run_whatever_its_budget() -> None:
+    few = changed(views=9)
+    for budget, seconds in (
+        ({"steps": 10_000}, None),
+        ({"preset": "quality"}, None),
+        ({"time_budget": 300}, 300),
+    ):
+        course = planned(few, **budget).schedule
+        assert (course.budget, course.expected_steps, course.ends_at) == (Budget(3600, seconds), 3600, 3600)
+        assert course.annealing.hold == 0.25
+        assert "ends after 400 steps on each, 3600" in planned(few, **budget).reasons["schedule"]
+    slow = planned(few, time_budget=5)  # fewer steps are expected, and more of them end it all the same
+    assert (slow.schedule.budget.steps, slow.schedule.expected_steps < 3600) == (3600, True)
+    assert "400 steps on each" not in slow.reasons["schedule"]
+    short = planned(few, steps=3600).schedule
+    assert (short.budget.steps, short.ends_at) == (3600, None)
+    for watched in (
+        planned(changed(views=12), steps=10_000),
+        planned(few, steps=10_000, target_psnr=30.0),
+        planned(changed(views=9, alignment=0.5), steps=10_000),  # all around, where more steps gain
+    ):
+        assert (watched.schedule.budget.steps, watched.schedule.ends_at) == (10_000, None)
 
 
 def test_a_target_alone_gets_the_steps_of_the_best_preset() -> None:

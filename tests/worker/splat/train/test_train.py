@@ -149,6 +149,15 @@ def test_a_time_budget_ends_on_time_with_rates_annealed() -> None:
     assert all(report.steps >= report.step for report in reports)
 
 
+def test_a_run_that_too_few_photos_end_says_so() -> None:
+    views, held_out = split()
+    course = plan(30, 600.0)
+    course = replace(course, schedule=replace(course.schedule, ends_at=30))
+    trained = train(first_engine(), views, held_out, course, extent=1.1)
+    assert trained.steps == 30
+    assert trained.stopped == f"{len(views)} photos from one side are too few for more than 30 steps"
+
+
 def test_a_resumed_run_goes_on_where_it_was(tmp_path: Path) -> None:
     views, held_out = split()
     whole = plan(240)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 from splatmill.schema import (
+    PHOTOS_PER_VALIDATION,
     PRESET_LONGEST,
     PRESET_VISITS,
     Preset,
@@ -16,9 +18,11 @@ from splatmill.schema import (
 from splatmill_worker.kernels.gpu.device import largest_budget
 from splatmill_worker.splat.plan.budget import Budget
 from splatmill_worker.splat.plan.facts import Facts, Speed
+from splatmill_worker.splat.plan.needs import HALF_TURN
 from splatmill_worker.splat.plan.photos import least_gain
 from splatmill_worker.splat.plan.plan import Kernels, Plan
 from splatmill_worker.splat.plan.reasons import Decision, by_option, switch
+from splatmill_worker.splat.plan.schedule import MOST_VISITS
 
 PIXELS_PER_GAUSSIAN = 50
 """Pixels of all training photos for each Gaussian that they resolve (decisions: PIXELS_PER_GAUSSIAN)."""
@@ -34,12 +38,14 @@ class Capacity(NamedTuple):
     budget: its limits in steps and seconds.
     steps: the number of steps that the budget is expected to allow.
     longest: steps up to which the budget is doubled where it proves too short; None: it stays.
+    ends_at: steps after which few photos from one side end the run; None where the budget does.
     """
 
     max_gaussians: Decision[int]
     budget: Decision[Budget]
     steps: Decision[int]
     longest: int | None = None
+    ends_at: int | None = None
 
 
 def decide_capacity(
@@ -53,7 +59,37 @@ def decide_capacity(
     most = _max_gaussians(facts, options, kernels, pixels, initial)
     # Charged as midway, in the logarithm, between the first Gaussians and the most (decisions: forecast).
     midway = math.sqrt(max(1, min(initial, most.value)) * most.value)
-    return Capacity(most, *_budget(facts, options, (facts.speed or ASSUMED_SPEED).step(pixels, midway)))
+    return _ended(
+        Capacity(most, *_budget(facts, options, (facts.speed or ASSUMED_SPEED).step(pixels, midway))),
+        facts,
+        most_steps(facts, options),
+    )
+
+
+def most_steps(facts: Facts, options: TrainOptions) -> int | None:
+    """Steps after which a training ends, whatever its budget: where the photos are too few to set one aside that shows
+    over-fitting, and look at the scene from one side. None where they are not.
+    """
+    watched = facts.views >= PHOTOS_PER_VALIDATION or options.target_psnr is not None
+    if watched or facts.alignment is None or facts.alignment <= HALF_TURN:
+        return None
+    return MOST_VISITS * facts.views
+
+
+def _ended(capacity: Capacity, facts: Facts, most: int | None) -> Capacity:
+    """`capacity` with a budget of `most` steps at most."""
+    budget, steps = capacity.budget, capacity.steps
+    if most is None or (budget.value.steps is not None and budget.value.steps <= most):
+        return capacity
+    if steps.value > most:
+        because = (
+            f"{steps.reason} With {facts.views} photos from one side, none is set aside to watch for over-fitting, so "
+            f"training ends after {MOST_VISITS} steps on each, {most}."
+        )
+        steps = Decision(most, because)
+    return capacity._replace(
+        budget=budget._replace(value=replace(budget.value, steps=most)), steps=steps, ends_at=most
+    )
 
 
 def decide_densification(options: TrainOptions, most: int, *, initial: int) -> Decision[bool]:

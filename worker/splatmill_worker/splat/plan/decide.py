@@ -93,6 +93,7 @@ def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
             decay_within=0.5 * shell if needs.far_shell.value and shell else None,
             annealing=annealing.value,
             dropout=dropout.value,
+            ends_at=capacity.ends_at,
             expected_steps=steps,
         ),
         image_size=image_size.value,

@@ -10,6 +10,10 @@ from splatmill_worker.splat.plan.rates import Annealing
 MANY_VISITS = 100
 """Steps on each photo after which training begins to learn the photos by heart (decisions: dropout)."""
 
+MOST_VISITS = 400
+"""Steps on each photo after which a training ends that has too few photos to set one aside, all from one side
+(decisions: MOST_VISITS)."""
+
 SETTLING = 0.5
 """Share of the steps between two densifications in which training restores the opacities that the first one decayed
 (decisions: SETTLING)."""
@@ -34,6 +38,7 @@ class Schedule:
         of the far shell is hidden from the photos, and decay would remove it. None: no such distance.
     annealing: how the learning rates fall.
     dropout: largest share of the Gaussians that a step leaves out at random; see `left_out`.
+    ends_at: steps after which few photos from one side end the run, whatever its budget; None where they do not.
     """
 
     budget: Budget
@@ -48,6 +53,7 @@ class Schedule:
     annealing: Annealing = field(default_factory=Annealing)
     dropout: float = 0.0
     longest: int | None = None
+    ends_at: int | None = None
 
     @property
     def reduced_until(self) -> int:

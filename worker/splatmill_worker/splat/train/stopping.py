@@ -15,6 +15,8 @@ def reason_to_stop(run: TrainingRun) -> str:
     plan, gain = run.plan, last_gain(run.validated)
     if run.progress >= 1.0:
         why = "the budget is spent"
+        if run.state.step == plan.schedule.ends_at:
+            why = f"{len(run.views)} photos from one side are too few for more than {run.state.step} steps"
         if run.state.shortened and gain is not None and gain < 0.0 and run.best is not None:
             why = f"more steps over-fit, so training went back to the scene after {run.best.state.step} steps"
         elif run.state.shortened:
