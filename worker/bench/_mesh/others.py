@@ -62,8 +62,8 @@ def of_depths(views: Sequence[View], step: int) -> Mesh:
         normal = torch.nn.functional.normalize(torch.linalg.cross(across, down), dim=-1).view(-1, 3)
         good = torch.isfinite(normal).all(1) & (torch.arange(len(whole)) % step == 0)
         parts.append((whole[good], -_away(normal[good], whole[good], view), view.color.view(-1, 3)[good]))
-    points, normals, colors = (torch.cat(column).numpy() for column in zip(*parts, strict=True))
-    return poisson(points, normals, colors)
+    positions, directions, colors = (torch.cat(column).numpy() for column in zip(*parts, strict=True))
+    return poisson(positions, directions, colors)
 
 
 def of_sparse_points(cameras_zip: Path) -> Mesh:

@@ -123,7 +123,8 @@ def on_solid(solid: Solid, count: int, random: np.random.Generator) -> Float:
     center = np.array(solid.center)
     if isinstance(solid, Sphere):
         direction = random.normal(size=(count, 3))
-        return center + solid.radius * direction / np.linalg.norm(direction, axis=1, keepdims=True)
+        unit: Float = direction / np.linalg.norm(direction, axis=1, keepdims=True)
+        return center + solid.radius * unit
     if isinstance(solid, Cylinder):
         side = 4 * math.pi * solid.radius * solid.half_height
         on_side = random.random(count) < side / area(solid)
@@ -145,17 +146,18 @@ def on_solid(solid: Solid, count: int, random: np.random.Generator) -> Float:
 
 def distances(points: Float, solids: Sequence[Solid]) -> Float:
     """Distance [n] from points [n, 3] to the nearest surface of the solids."""
-    return np.min([distance(points, solid) for solid in solids], axis=0)
+    nearest: Float = np.min([distance(points, solid) for solid in solids], axis=0)
+    return nearest
 
 
 def distance(points: Float, solid: Solid) -> Float:
     """Distance [n] from points [n, 3] to the surface of one solid."""
     if isinstance(solid, Disc):
         beyond = np.maximum(np.hypot(points[:, 0], points[:, 1]) - solid.radius, 0.0)
-        return np.hypot(beyond, points[:, 2] - solid.z)
+        return np.asarray(np.hypot(beyond, points[:, 2] - solid.z), np.float64)
     local = points - np.array(solid.center)
     if isinstance(solid, Sphere):
-        return np.abs(np.linalg.norm(local, axis=1) - solid.radius)
+        return np.asarray(np.abs(np.linalg.norm(local, axis=1) - solid.radius), np.float64)
     if isinstance(solid, Cylinder):
         q = np.stack(
             [np.hypot(local[:, 0], local[:, 1]) - solid.radius, np.abs(local[:, 2]) - solid.half_height], 1
@@ -167,4 +169,4 @@ def distance(points: Float, solid: Solid) -> Float:
         )
         q = np.abs(turned) - np.array(solid.half)
     outside = np.linalg.norm(np.maximum(q, 0.0), axis=1)
-    return np.abs(outside + np.minimum(q.max(axis=1), 0.0))
+    return np.asarray(np.abs(outside + np.minimum(q.max(axis=1), 0.0)), np.float64)
