@@ -21,7 +21,7 @@ ModelId = Annotated[
 FILES = ("model.ply", "report.json", "report.png", "report.html", "cameras.json", "cameras.zip")
 """The files that `train` and `download` write to the output folder."""
 
-OPTIONAL_FILES = ("frame.json", "preview.jpg", "progress.mp4")
+OPTIONAL_FILES = ("frame.json", "preview.jpg", "poster.jpg", "progress.mp4")
 """Files that are also written if the model has them."""
 
 
