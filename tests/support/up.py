@@ -61,6 +61,8 @@ class Up:
         assert line, self.log.read_text()
         self.http.close()
         self.http = httpx.Client(base_url=json.loads(line)["url"], timeout=30, verify=False)
+        # It is started last, and a page that asks for a picture before it listens logs an error.
+        wait_for(lambda: self.http.get("/readyz").json()["checks"]["renderer"] == "ok")
         return self
 
     def stop(self) -> int:

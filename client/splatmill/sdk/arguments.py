@@ -54,6 +54,7 @@ class TrainArguments(TypedDict, total=False):
     densify: Switch | Literal["auto", "on", "off"]
     cluster_culling: Switch | Literal["auto", "on", "off"]
     antialias: Switch | Literal["auto", "on", "off"]
+    lpips: Switch | Literal["auto", "on", "off"]
     backend: Backend | Literal["auto", "reference", "cpu", "gpu"]
     seed: int
 
