@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import math
 import re
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -37,11 +38,13 @@ NOTHING: dict[str, Any] = {
 
 
 @pytest.fixture(autouse=True)
-def _as_ever(service: Up, model: SmallModel) -> None:
-    answer = service.http.patch(f"/v1/models/{model.id}/presentation", json=NOTHING)
-    assert answer.status_code == 200, answer.text
+def _as_ever(service: Up, model: SmallModel) -> Iterator[None]:
+    """Files that share the service find the model as it was."""
     # Pages load this file; until the renderer listens, it cannot be made.
     wait_for(lambda: service.http.head(f"/v1/models/{model.id}/download/sog").status_code == 200, 60)
+    yield
+    answer = service.http.patch(f"/v1/models/{model.id}/presentation", json=NOTHING)
+    assert answer.status_code == 200, answer.text
 
 
 def kept(service: Up, model: SmallModel) -> dict[str, Any]:
