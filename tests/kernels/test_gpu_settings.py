@@ -257,7 +257,7 @@ BRANCHES: dict[str, dict[str, set[Any]]] = {
     "row_stats_kernel": {"MASK": {True, False}},
     "value_kernel": {"MASK": {True, False}, "SLOPES": {True, False}},
     "gradient_kernel": {"MASK": {True, False}},
-    "compact_kernel": {}, "total_kernel": {}, "down_kernel": {}, "stats_kernel": {}, "scores_kernel": {},
+    "compact_kernel": {}, "median_depth_kernel": {}, "total_kernel": {}, "down_kernel": {}, "stats_kernel": {}, "scores_kernel": {},
     "planes_kernel": {}, "drift_kernel": {}, "knn_kernel": {},
 }  # fmt: skip
 """The values of constants that choose a branch, by kernel."""
@@ -306,5 +306,6 @@ def alone() -> None:
             still = CASE.project(leaves, viewmat, "gpu")
             lists = ops.bin(still, WIDTH, HEIGHT, backend="gpu")
             color, _, _ = ops.composite(still, lists, WIDTH, HEIGHT, backend="gpu")
+            ops.median_depth(still, lists, WIDTH, HEIGHT, backend="gpu")
             ops.loss(color, photo, backend="gpu")
     ops.knn(torch.ones(4, 3, device=DEVICE), backend="gpu")

@@ -28,6 +28,7 @@ def test_a_model_says_what_it_is(app: ServedApp, model_id: str) -> None:
     assert {f["name"] for f in model["files"]} == set(layout.MODEL_FILES) - {
         "cameras.zip",
         "frame.json",
+        "poster.jpg",
         "report.png",
         "progress.mp4",
     }

@@ -15,6 +15,7 @@ HEADER = "X-Forwarded-Prefix"
 
 OWN_PATHS = frozenset(
     {
+        "compare",
         "docs",
         "glossary",
         "healthz",
