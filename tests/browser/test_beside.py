@@ -31,6 +31,9 @@ def other(service: Up, model: SmallModel) -> Iterator[str]:
     service.http.delete(f"/v1/jobs/{made}").raise_for_status()
 
 
+DRAWN = "[...document.querySelectorAll('#pair .view')].map((view) => Number(view.dataset.frames) > 1)"
+"""Whether each view was drawn again after its Gaussians were sorted."""
+
 POSES = "[...document.querySelectorAll('#pair .view')].map((view) => view.dataset.frames)"
 
 
@@ -64,6 +67,10 @@ def test_one_camera_sees_two_models_that_share_their_coordinates(
     row = page.get_by_role("row").filter(has_text=name)
     for column, id in enumerate((other, model.id), 1):
         expect(row.get_by_role("cell").nth(column)).to_contain_text(f"{cameras[id][name]['psnr']:.1f}")
+
+    # Both are drawn, in place of the pictures that stand for them until then.
+    expect(page.locator("#pair .view img")).to_have_count(0, timeout=WAIT)
+    assert page.evaluate(DRAWN) == [True, True]
 
     # A model of which the other one moves: both draw anew, and both show the same camera.
     before = page.evaluate(POSES)

@@ -65,7 +65,8 @@ export class Splats {
     this.app.init(settings);
     this.app.autoRender = false;
     const [r, g, b] = options.background ?? [0, 0, 0];
-    this.eye = new pc.Entity("camera");
+    // Without an app, an entity belongs to the last one of the page, which may be that of another view.
+    this.eye = new pc.Entity("camera", this.app);
     this.eye.addComponent("camera", { clearColor: new pc.Color(r, g, b, 1), toneMapping: pc.TONEMAP_NONE });
     this.app.root.addChild(this.eye);
     // Exact pictures before fast ones: colours follow every movement, and small Gaussians are drawn too.
@@ -121,7 +122,7 @@ export class Splats {
       throw error;
     }
     const before = this.splats;
-    this.splats = new pc.Entity("splats");
+    this.splats = new pc.Entity("splats", this.app);
     this.splats.addComponent("gsplat", { asset });
     app.root.addChild(this.splats);
     this.leaveOut(this.limits);
