@@ -6,7 +6,15 @@ from collections.abc import Iterable
 OUTPUT_MARKS = ("model.ply", "report.json", "cameras.json")
 """Names of files of which a folder of results holds two at least. The first two are written before any picture."""
 
-OUTPUT_MEDIA = ("preview.jpg", "poster.jpg", "report.png", "novel_view.png", "orbit.mp4", "progress.mp4", "cameras.zip")
+OUTPUT_MEDIA = (
+    "preview.jpg",
+    "poster.jpg",
+    "report.png",
+    "novel_view.png",
+    "orbit.mp4",
+    "progress.mp4",
+    "cameras.zip",
+)
 """Names of pictures, videos and zips that are written to a folder of results."""
 
 
