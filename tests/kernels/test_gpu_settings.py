@@ -257,8 +257,8 @@ BRANCHES: dict[str, dict[str, set[Any]]] = {
     "row_stats_kernel": {"MASK": {True, False}},
     "value_kernel": {"MASK": {True, False}, "SLOPES": {True, False}},
     "gradient_kernel": {"MASK": {True, False}},
-    "compact_kernel": {}, "median_depth_kernel": {}, "total_kernel": {}, "down_kernel": {}, "stats_kernel": {}, "scores_kernel": {},
-    "planes_kernel": {}, "drift_kernel": {}, "knn_kernel": {},
+    "compact_kernel": {}, "total_kernel": {}, "down_kernel": {}, "stats_kernel": {}, "scores_kernel": {},
+    "planes_kernel": {}, "drift_kernel": {}, "knn_kernel": {}, "median_depth_kernel": {},
 }  # fmt: skip
 """The values of constants that choose a branch, by kernel."""
 
