@@ -66,6 +66,8 @@ def main() -> int:
                     theme: browser.new_context(base_url=base, color_scheme=theme, viewport=WINDOW).new_page()  # type: ignore[arg-type]  # both are themes
                     for theme in ("light", "dark")
                 }
+                for page in pages.values():
+                    page.set_default_timeout(180_000)  # the job trains beside the browser
                 walk(pages, http, sorted(photos.glob("*.jpg")) or sorted(photos.glob("*.png")))
                 browser.close()
         finally:
