@@ -342,8 +342,8 @@ class TrainOptions(Request):
         default=Switch.auto,
         description=(
             "Measure LPIPS, a distance of pictures by image networks, on the held-out photos at the end. With auto, "
-            "this is done where the weights of these networks are installed on the machine that trains; with on, a "
-            "machine without them refuses the job."
+            "this is done where the weights of these networks are installed on the machine that trains, unless a "
+            "time budget is set; with on, a machine without them refuses the job."
         ),
         json_schema_extra=_ENGINE,
     )

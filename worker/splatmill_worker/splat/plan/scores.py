@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from splatmill.schema import TrainOptions
+from splatmill.schema import Switch, TrainOptions
 from splatmill_worker.splat.plan.facts import Facts
 from splatmill_worker.splat.plan.reasons import Decision, switch
 
@@ -13,6 +13,10 @@ def decide_lpips(facts: Facts, options: TrainOptions) -> Decision[bool]:
         return Decision(False, facts.no_lpips)
     if not facts.held_out:
         return Decision(False, "LPIPS is measured on held-out photos, and there are none.")
+    if options.lpips is Switch.auto and options.time_budget is not None:
+        return Decision(
+            False, "LPIPS takes a second and more of each photo; with a time budget, lpips has to be on."
+        )
     because = (
         f"The weights of LPIPS are installed; it is measured on {facts.held_out} held-out photos at the end."
     )
