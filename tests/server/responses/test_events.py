@@ -223,10 +223,10 @@ def test_the_log_of_an_ended_job_outlives_redis(app: ServedApp, end: str) -> Non
 def test_a_log_that_cannot_be_stored_is_stored_later(app: ServedApp) -> None:
     job_id = app.job()
     app.begin(job_id)
-    app.say(job_id, LogEvent(message="said"), StateEvent(state=JobState.failed))
     assert app.service.storage.root is not None
     jobs = app.service.storage.root / "jobs"
     jobs.write_text("in the way")
+    app.say(job_id, LogEvent(message="said"), StateEvent(state=JobState.failed))
     app.service.reaper.tick()
     jobs.unlink()
     app.service.reaper.tick()
