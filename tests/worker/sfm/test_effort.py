@@ -14,7 +14,7 @@ import pytest
 
 from splatmill_worker import sfm, synthetic
 from splatmill_worker.colmap import pycolmap
-from splatmill_worker.sfm import features, trials
+from splatmill_worker.sfm import effort, features, trials
 from splatmill_worker.sfm.features import FeatureStore
 from splatmill_worker.sfm.mapping import mapper
 from splatmill_worker.sfm.matching import pairs
@@ -111,6 +111,33 @@ def test_the_global_mapper_is_first_for_many_photos_in_a_dense_graph(
     assert _tried(count, verified, count, tmp_path, monkeypatch) == [(first, False)]
 
 
+@pytest.mark.parametrize(
+    ("registered", "again", "called", "kept"),
+    [(5, 6, "extended", 6), (5, 4, "extended", 5), (4, 9, "anew", 9), (4, 3, "anew", 4)],
+    ids=["more", "fewer", "less than half, more", "less than half, fewer"],
+)
+def test_more_pairs_add_photos_to_a_model_that_has_half_of_them(
+    registered: int, again: int, called: str, kept: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[str] = []
+
+    def answer(name: str) -> Any:
+        def mapping(*_: object) -> SimpleNamespace:
+            calls.append(name)
+            return SimpleNamespace(registered=again)
+
+        return mapping
+
+    monkeypatch.setattr(effort, "extended_mapping", answer("extended"))
+    monkeypatch.setattr(effort, "best_mapping", answer("anew"))
+    monkeypatch.setattr(effort, "registered_counts", lambda mapped: (mapped.registered, mapped.registered))
+    run: Any = SimpleNamespace(count=10)
+    result: Any = SimpleNamespace(store=SimpleNamespace(database=None), verified=[])
+    mapped: Any = SimpleNamespace(registered=registered)
+    assert effort._mapped_with_more(run, result, mapped).registered == kept
+    assert calls == [called]
+
+
 def _tried(
     count: int,
     verified: list[tuple[int, int]],
@@ -128,7 +155,7 @@ def _tried(
     monkeypatch.setattr(mapper, "run", run)
     monkeypatch.setattr(trials, "registered_counts", lambda _: (registered, registered))
     asked: Any = SimpleNamespace(
-        options=sfm.SfmOptions(), best_mapper=None, count=count, threads=1, show=None, cancelled=None,
+        options=sfm.SfmOptions(), best_mapper=None, count=count, threads=1, show=None, cancelled=None, on_mapping=None,
         clock=lambda _: nullcontext(),
     )  # fmt: skip
     trials.best_mapping(asked, folder / "database.db", verified)

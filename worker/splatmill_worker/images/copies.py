@@ -7,7 +7,7 @@ copy shows agrees everywhere after that: a turntable's still background alone do
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import PurePosixPath
@@ -130,12 +130,16 @@ def small_grey(image: Image.Image, side: int = SMALL_SIDE) -> Bytes:
     return np.asarray(small.convert("L"))
 
 
-def copies(pictures: Sequence[SmallPicture]) -> dict[int, int]:
+def copies(
+    pictures: Sequence[SmallPicture], on_compared: Callable[[int], None] = lambda done: None
+) -> dict[int, int]:
     """The index of each photo that is a copy, and of the photo that is kept in its place.
 
     Kept is the photo with the most pixels; of those with as many, one with EXIF tags, then the one with the fewest
     clipped pixels, and then that with the shortest name. For 1,000 photos that are no copies this takes 0.5 to 5
     seconds of one core, by how many of them look alike.
+
+    on_compared: called with the number of photos that were compared so far, after each.
     """
     ranked = sorted(
         range(len(pictures)),
@@ -150,13 +154,14 @@ def copies(pictures: Sequence[SmallPicture]) -> dict[int, int]:
     kept: set[int] = set()
     found: dict[int, int] = {}
     likely = _likely(pictures)
-    for index in ranked:
+    for done, index in enumerate(ranked, 1):
         for other, turns in likely.get(index, ()):
             if other in kept and is_copy(pictures[index], pictures[other], turns):
                 found[index] = other
                 break
         else:
             kept.add(index)
+        on_compared(done)
     return found
 
 

@@ -146,7 +146,7 @@ def prepare(
     largest is kept. Of a file with several pictures, the first is used.
 
     masks: folder of the masks, if there is one; others may lie among the photos (`splatmill.schema.files.masks`).
-    on_progress: called as ("images", files examined, files in all, name of the file).
+    on_progress: called as ("images", files examined, files in all, name of the file), and while they are compared.
 
     Raises Refusal for a mask that is too large to be decoded, for masks that hide all of every photo, where no picture
     is a photo by its pixels (`images.no_photo`), and for archives
@@ -201,7 +201,14 @@ def prepare(
     ordered = sorted(photos.values(), key=lambda photo: photo.name)
     no_photo.check({photo.name: photo.kind for photo in ordered})
     ordered = _without_depth(ordered, found)
-    originals = copies.copies([small[photo.name] for photo in ordered])
+
+    def compared(done: int) -> None:
+        if cancelled():
+            raise Cancelled("Examining the photos was cancelled.")
+        note = f"compared {done} of {len(ordered)} with the others"
+        on_progress("images", len(candidates), len(candidates), note)
+
+    originals = copies.copies([small[photo.name] for photo in ordered], compared)
     copied = [(ordered[copy].name, ordered[original].name) for copy, original in originals.items()]
     ordered = _without_copies(ordered, originals, found)
     known = (

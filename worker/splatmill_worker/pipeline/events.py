@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 
 from splatmill.schema import Event, LogEvent, MetricEvent, PreviewEvent, ProgressEvent
+from splatmill_worker.pipeline.remaining import StagePace
 from splatmill_worker.splat.engine.protocol import Engine
 from splatmill_worker.splat.picture import save_jpeg
 from splatmill_worker.splat.plan.plan import Plan
@@ -18,10 +20,15 @@ Emit = Callable[[Event], None]
 
 
 def progress_events(emit: Emit) -> Callable[[str, int, int, str], None]:
-    """A callback (stage, done, total, note) that emits each call as a progress event."""
+    """A callback (stage, done, total, note) that emits each call as a progress event, with its seconds left."""
+    paces: dict[str, StagePace] = {}
 
     def emit_progress(stage: str, done: int, total: int, note: str) -> None:
-        emit(ProgressEvent(stage=stage, done=done, total=total or None, note=note or None))
+        now = time.monotonic()
+        pace = paces.setdefault(stage, StagePace(now))
+        pace.add(done, now)
+        left = pace.remaining(total)
+        emit(ProgressEvent(stage=stage, done=done, total=total or None, note=note or None, eta=left))
 
     return emit_progress
 

@@ -8,10 +8,11 @@ from splatmill_worker.colmap import pycolmap
 from splatmill_worker.errors import SfmFailed
 from splatmill_worker.sfm import features
 from splatmill_worker.sfm.features import FeatureStore
+from splatmill_worker.sfm.mapping import mapper
 from splatmill_worker.sfm.matching import pairs, two_view
 from splatmill_worker.sfm.options import LEAN, Effort
 from splatmill_worker.sfm.run import VERSION, EffortResult, SfmRun, digest
-from splatmill_worker.sfm.trials import best_mapping, registered_counts
+from splatmill_worker.sfm.trials import best_mapping, extended_mapping, registered_counts
 
 CONNECTING_ROUNDS = 2
 """Largest number of times that more pairs are matched to connect the components of the view graph."""
@@ -71,12 +72,22 @@ def solve_at(run: SfmRun, effort: Effort, earlier: EffortResult | None) -> Effor
         result.mapped = best_mapping(run, result.store.database, result.verified)
         left = _unregistered(run, result)
         if left and _match_unregistered(run, result, left, database):
-            again = best_mapping(run, result.store.database, result.verified)
-            if registered_counts(again) > registered_counts(result.mapped):
-                result.mapped = again
+            result.mapped = _mapped_with_more(run, result, result.mapped)
     finally:
         database.close()
     return result
+
+
+def _mapped_with_more(run: SfmRun, result: EffortResult, mapped: mapper.Mapped) -> mapper.Mapped:
+    """`mapped` with photos placed by pairs that were verified since: added to its largest model, or mapped anew.
+
+    They are mapped anew only where the model has less than half of the photos, and so may be of the wrong part.
+    """
+    if 2 * mapped.registered >= run.count:
+        again = extended_mapping(run, result.store.database, mapped)
+    else:
+        again = best_mapping(run, result.store.database, result.verified)
+    return again if registered_counts(again) > registered_counts(mapped) else mapped
 
 
 def registered_photos(model: pycolmap.Reconstruction) -> set[int]:

@@ -21,15 +21,12 @@ from splatmill_worker.images.load import training_size
 from splatmill_worker.images.masks import shown_part
 from splatmill_worker.images.prepare import UsablePhoto
 from splatmill_worker.scene import MIN_SHOWN
-from splatmill_worker.sfm.callbacks import OnProgress, native_token, stop_if
+from splatmill_worker.sfm.callbacks import OnProgress, stop_if, watched
 from splatmill_worker.sfm.cameras import CameraGroup
 from splatmill_worker.sfm.options import Effort
 
 MAX_IMAGES = 2147483647
 """COLMAP's kMaxNumImages: it numbers the pair of images a < b as MAX_IMAGES * a + b."""
-
-BATCH = 8
-"""Photos per native call; progress is reported, and a cancelled run ends, between two calls."""
 
 
 @dataclass(frozen=True)
@@ -112,23 +109,28 @@ def extract(
     with ThreadPoolExecutor(threads) as pool:
         for group in groups:
             missing = [index for index in group.photos if names[index] not in extracted]
-            for start in range(0, len(missing), BATCH):
-                batch = missing[start : start + BATCH]
+            # Progress is reported between two calls, and a photo of the highest effort takes seconds.
+            for start in range(0, len(missing), threads):
+                batch = missing[start : start + threads]
                 stop_if(cancelled)
                 list(pool.map(lambda index: _reduce(photos[index], effort.side, store, names[index]), batch))
                 # COLMAP would otherwise create a new camera for each batch.
                 reader.existing_camera_id = _camera_of(group, names, store.database)
-                with native_token(cancelled) as token:
+                files = [names[index] for index in batch]
+
+                def extract_batch(token: pycolmap.CancellationToken, files: list[str] = files) -> None:
                     pycolmap.extract_features(
                         store.database,
                         store.images,
-                        [names[index] for index in batch],
+                        files,
                         pycolmap.CameraMode.SINGLE,
                         reader,
                         options,
                         pycolmap.Device.cpu,
                         token,
                     )
+
+                watched(extract_batch, cancelled)
                 done += len(batch)
                 on_progress("features", done, len(photos), photos[batch[-1]].name)
     _set_cameras(groups, names, store.database)

@@ -79,7 +79,7 @@ def _with_plausible_intrinsics(
             run.threads,
             run.options.seed,
             fixed_intrinsics=True,
-            on_progress=lambda done, total: run.on_progress("mapping", done, total, "photos placed"),
+            on_progress=run.on_mapping,
             on_model=run.show,
             cancelled=run.cancelled,
         )
@@ -99,8 +99,17 @@ def _adjusted(
     run: SfmRun, model: pycolmap.Reconstruction, fixed: bool
 ) -> tuple[pycolmap.Reconstruction, tuple[str, ...]]:
     """The model after the last bundle adjustment, and warnings about its lenses."""
+    placed = model.num_reg_images()
+
+    def report(iterations: int) -> None:
+        run.on_mapping(
+            placed, run.count, f"adjusting {placed} cameras and their lenses, iteration {iterations + 1}"
+        )
+
     if fixed or run.options.camera_model != "auto":
-        adjust.bundle_adjust(model, run.threads, fixed_intrinsics=fixed, cancelled=run.cancelled)
+        adjust.bundle_adjust(
+            model, run.threads, fixed_intrinsics=fixed, cancelled=run.cancelled, on_iterations=report
+        )
         return model, ()
     group_of = {index: group for group in run.groups for index in group.photos}
     groups = {
@@ -111,7 +120,7 @@ def _adjusted(
         camera_id: group.focal * max(model.cameras[camera_id].width, model.cameras[camera_id].height)
         for camera_id, group in groups.items()
     }
-    adjusted = adjust.adjust_with_lenses(model, initial, run.threads, run.cancelled)
+    adjusted = adjust.adjust_with_lenses(model, initial, run.threads, run.cancelled, report)
     if adjusted.tied:
         run.notes.append(
             "The photos do not determine whether the lens stretches them, since the camera moved along a line, around "

@@ -101,6 +101,10 @@ class SfmRun:
         """Number of photos."""
         return len(self.prepared.photos)
 
+    def on_mapping(self, done: int, total: int, note: str) -> None:
+        """Report the progress of a mapper."""
+        self.on_progress("mapping", done, total, note)
+
     def show(self, model: pycolmap.Reconstruction) -> None:
         """Let the observer look at the model that a mapper works on, where it wants to."""
         if self.observer is not None and self.observer.is_due():

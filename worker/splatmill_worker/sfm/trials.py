@@ -1,4 +1,4 @@
-"""The best of up to three mappings of the same view graph."""
+"""The best of up to three mappings of the same view graph, and one that goes on with more pairs."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def best_mapping(run: SfmRun, database: Path, verified: Collection[pairs.Pair]) 
                 run.threads,
                 run.options.seed,
                 relaxed=relaxed,
-                on_progress=lambda done, total: run.on_progress("mapping", done, total, "photos placed"),
+                on_progress=run.on_mapping,
                 on_model=run.show,
                 cancelled=run.cancelled,
             )
@@ -72,3 +72,18 @@ def best_mapping(run: SfmRun, database: Path, verified: Collection[pairs.Pair]) 
     assert best is not None  # there is at least one trial
     run.best_mapper = best.mapper
     return best
+
+
+def extended_mapping(run: SfmRun, database: Path, mapped: mapper.Mapped) -> mapper.Mapped:
+    """`mapped` with the photos that more pairs in COLMAP's database, which it was made from, let it place."""
+    with run.clock("mapping"):
+        return mapper.extend(
+            mapped,
+            database,
+            run.count,
+            run.threads,
+            run.options.seed,
+            on_progress=run.on_mapping,
+            on_model=run.show,
+            cancelled=run.cancelled,
+        )

@@ -4,8 +4,11 @@ The models are generated: points, cameras, and observations with an error of a t
 focal length. Does not prove that photos of such motions can be matched.
 """
 
+import numpy as np
 import pytest
 
+from splatmill_worker.errors import Cancelled
+from splatmill_worker.sfm.mapping import adjust
 from splatmill_worker.sfm.mapping.adjust import adjust_with_lenses
 from tests.support.motions import FOCAL, Motion, ball, circle, grid, line, model_of
 
@@ -40,6 +43,31 @@ def test_a_camera_of_few_photos_keeps_the_simple_lens_beside_one_of_many() -> No
     adjusted = adjust_with_lenses(model, initial, 1, lambda: False)
     lenses = {camera: lens.model.name for camera, lens in adjusted.model.cameras.items()}
     assert lenses == {1: "OPENCV", 2: "SIMPLE_RADIAL"}
+
+
+def test_a_large_model_reports_its_iterations_and_ends_where_a_small_one_does(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    start = 1.15 * FOCAL
+    whole = adjust_with_lenses(model_of(ball, start), {1: start}, 1, lambda: False)
+    monkeypatch.setattr(adjust, "ITERATED_OBSERVATIONS", 1)
+    done: list[int] = []
+    parts = adjust_with_lenses(model_of(ball, start), {1: start}, 1, lambda: False, done.append)
+    assert done[:2] == [0, adjust.LEAST_ITERATIONS]
+    assert len(done) < adjust.MAX_ITERATIONS // adjust.LEAST_ITERATIONS  # it has converged
+    error = whole.model.compute_mean_reprojection_error()
+    assert parts.model.compute_mean_reprojection_error() == pytest.approx(error, rel=1e-4)
+    np.testing.assert_allclose(
+        parts.model.cameras[1].params, whole.model.cameras[1].params, rtol=2e-3, atol=2e-3
+    )
+
+
+def test_a_cancelled_adjustment_ends_between_iterations(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(adjust, "ITERATED_OBSERVATIONS", 1)
+    done: list[int] = []
+    with pytest.raises(Cancelled):
+        adjust_with_lenses(model_of(ball, 1.15 * FOCAL), {1: FOCAL}, 1, lambda: len(done) == 2, done.append)
+    assert done == [0, adjust.LEAST_ITERATIONS]
 
 
 def test_photos_that_are_not_registered_are_left_out() -> None:

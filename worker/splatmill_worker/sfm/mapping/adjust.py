@@ -6,6 +6,7 @@ import copy
 import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -31,6 +32,13 @@ along a line it falls to half of the true one (decisions: FOCAL_DEVIATION)."""
 MAX_ITERATIONS = 50
 """Iterations of the last bundle adjustment, at most."""
 
+ITERATED_OBSERVATIONS = 2_000_000
+"""Observations times iterations of one call of the solver: about four seconds of one core. The next call begins with a
+new trust region, so that fewer would take more iterations."""
+
+LEAST_ITERATIONS = 3
+"""Iterations of one call of the solver, at least."""
+
 FUNCTION_TOLERANCE = 1e-6
 """Relative decrease of the cost below which the last bundle adjustment has converged."""
 
@@ -54,6 +62,7 @@ def adjust_with_lenses(
     initial: Mapping[int, float],
     threads: int,
     cancelled: Callable[[], bool],
+    on_iterations: Callable[[int], None] = lambda done: None,
 ) -> Adjusted:
     """Adjust all poses and points, and of each SIMPLE_RADIAL camera the parameters that its photos determine.
 
@@ -64,14 +73,16 @@ def adjust_with_lenses(
 
     model: is not changed.
     initial: focal length that a camera had before any photo was matched, in pixels, by its id.
+    on_iterations: as that of `bundle_adjust`, which is called up to three times.
     """
+    adjust = partial(bundle_adjust, threads=threads, cancelled=cancelled, on_iterations=on_iterations)
     model = registered(model)  # the covariance needs the pose of every photo
     rich = _well_observed(model)
     tied: set[int] = set()
     while rich:
         trial = copy.deepcopy(model)
         _use_opencv(trial, rich)
-        deviations = Deviations.of(trial, bundle_adjust(trial, threads, cancelled=cancelled))
+        deviations = Deviations.of(trial, adjust(trial))
         loose = {camera for camera in rich if not deviations.stretch_is_determined(trial.cameras[camera])}
         if not loose:
             if implausible_intrinsics(trial) is None:
@@ -79,15 +90,24 @@ def adjust_with_lenses(
             break
         tied |= loose
         rich -= loose
-    deviations = Deviations.of(model, bundle_adjust(model, threads, cancelled=cancelled))
+    deviations = Deviations.of(model, adjust(model))
     assumed = {camera for camera in initial if not deviations.focal(model.cameras[camera]) <= FOCAL_DEVIATION}
     if assumed:
         for camera in assumed:
             params = np.array(model.cameras[camera].params)
             params[model.cameras[camera].focal_length_idxs()] = initial[camera]
             model.cameras[camera].params = params.tolist()
-        bundle_adjust(model, threads, fixed_focal=True, cancelled=cancelled)
+        adjust(model, fixed_focal=True)
     return Adjusted(model, frozenset(tied), frozenset(assumed))
+
+
+def iterations_at_once(model: pycolmap.Reconstruction, most: int) -> int:
+    """Iterations of one call of the solver, of `most` in all.
+
+    COLMAP holds Python's lock while it solves, so that nothing is reported and nobody can cancel meanwhile.
+    """
+    observations = max(1, model.compute_num_observations())
+    return min(most, max(LEAST_ITERATIONS, ITERATED_OBSERVATIONS // observations))
 
 
 def _well_observed(model: pycolmap.Reconstruction) -> set[int]:
@@ -160,13 +180,15 @@ def bundle_adjust(
     fixed_intrinsics: bool = False,
     fixed_focal: bool = False,
     cancelled: Callable[[], bool],
+    on_iterations: Callable[[int], None] = lambda done: None,
 ) -> pycolmap.CeresBundleAdjuster:
     """Adjust all poses, points and (unless fixed) lenses to convergence, with a robust loss, in place.
 
     fixed_intrinsics: keep focal lengths and distortion.
     fixed_focal: keep focal lengths.
+    on_iterations: called with the number of iterations so far, every few seconds in a large model.
 
-    Returns the solved problem. Raises Cancelled at the end, when the caller has asked to stop.
+    Returns the solved problem. Raises Cancelled between iterations, as often, when the caller has asked to stop.
     """
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_principal_point = False
@@ -175,7 +197,6 @@ def bundle_adjust(
     options.ceres.use_gpu = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
     options.ceres.solver_options.num_threads = threads
-    options.ceres.solver_options.max_num_iterations = MAX_ITERATIONS
     options.ceres.solver_options.function_tolerance = FUNCTION_TOLERANCE
     options.ceres.min_num_residuals_for_cpu_multi_threading = 5000
     config = pycolmap.BundleAdjustmentConfig()
@@ -183,8 +204,14 @@ def bundle_adjust(
         config.add_image(image_id)
     # Fixes the seven degrees of gauge freedom, as `pycolmap.bundle_adjustment` does; that function also logs.
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    at_once = iterations_at_once(model, MAX_ITERATIONS)
+    options.ceres.solver_options.max_num_iterations = at_once
     adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
-    adjuster.solve()
+    for done in range(0, MAX_ITERATIONS, at_once):
+        on_iterations(done)
+        stop_if(cancelled)
+        if adjuster.solve().termination_type != pycolmap.BundleAdjustmentTerminationType.NO_CONVERGENCE:
+            break
     model.update_point_3d_errors()
     stop_if(cancelled)
     return adjuster

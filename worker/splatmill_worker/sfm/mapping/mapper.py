@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import copy
+import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.sfm import checks
-from splatmill_worker.sfm.callbacks import stop_if
+from splatmill_worker.sfm.callbacks import stop_if, watched
+from splatmill_worker.sfm.mapping.incremental import IncrementalMapping
 from splatmill_worker.sfm.mapping.merge import merge
 
 Mapper = Literal["incremental", "global"]
+
+GLOBAL_REPORT_SECONDS = 2.0
+"""Seconds between two reports of the global mapper, which does not say how far it is."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +62,7 @@ def run(
     *,
     relaxed: bool = False,
     fixed_intrinsics: bool = False,
-    on_progress: Callable[[int, int], None],
+    on_progress: Callable[[int, int, str], None],
     on_model: Callable[[pycolmap.Reconstruction], None] = lambda _: None,
     cancelled: Callable[[], bool],
 ) -> Mapped:
@@ -64,41 +70,105 @@ def run(
 
     relaxed: accept smaller triangulation angles and fewer inliers (incremental mapper only).
     fixed_intrinsics: keep focal lengths and distortion as they are in the database.
-    on_progress: called as (photos registered, count), by the incremental mapper only.
-    on_model: called with the model that grows, after each registered photo, by the incremental mapper only. The mapper
-        waits meanwhile.
+    on_progress: called as (photos placed, count, note) after each step of the incremental mapper; by the global one,
+        which places all photos at once, every few seconds.
+    on_model: called with the model that grows, after each step of the incremental mapper, which waits meanwhile.
 
-    Raises Cancelled: between two photos in the incremental mapper, at the end in the global one.
+    Raises Cancelled: between two steps of the incremental mapper, at the end in the global one.
     """
     stop_if(cancelled)
     database = pycolmap.Database.open(database_path)
     try:
-        manager = pycolmap.ReconstructionManager()
         if mapper == "incremental":
             options = _incremental_options(threads, seed, relaxed, fixed_intrinsics)
-            incremental = pycolmap.IncrementalPipeline(options, database, manager)
-            registered = 0
-
-            def report() -> None:
-                nonlocal registered
-                registered = min(registered + 1, count)
-                on_progress(registered, count)
-                on_model(manager.get(manager.size() - 1))
-                stop_if(cancelled)
-
-            callback = pycolmap.IncrementalPipelineCallback
-            incremental.add_callback(callback.INITIAL_IMAGE_PAIR_REG_CALLBACK, report)
-            incremental.add_callback(callback.NEXT_IMAGE_REG_CALLBACK, report)
-            incremental.run()
+            mapping = IncrementalMapping(database, options, _Steps(count, on_progress, on_model), cancelled)
+            models = sorted(mapping.models(), key=_size)
+            # Weak evidence is enough only beside a model of most photos: a small one may be of alike things.
+            if models and 2 * models[0].num_reg_images() >= count:
+                mapping.extended(models[0])
         else:
-            pycolmap.GlobalPipeline(_global_options(threads, seed, fixed_intrinsics), database, manager).run()
+            models = _global_models(
+                database, _global_options(threads, seed, fixed_intrinsics), count, on_progress, cancelled
+            )
     finally:
         database.close()
     stop_if(cancelled)
-    models = [manager.get(index) for index in range(manager.size())]
-    models.sort(key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
+    models.sort(key=_size)
     models, merged, notes = merge_models(models)
     return Mapped(mapper, tuple(models), merged, notes)
+
+
+def extend(
+    mapped: Mapped,
+    database_path: Path,
+    count: int,
+    threads: int,
+    seed: int,
+    *,
+    on_progress: Callable[[int, int, str], None],
+    on_model: Callable[[pycolmap.Reconstruction], None],
+    cancelled: Callable[[], bool],
+) -> Mapped:
+    """Add photos to the largest of the models, by pairs that COLMAP's database has gained since they were made.
+
+    The arguments are those of `run`, whose models are left as they are. Raises Cancelled between two steps.
+    """
+    if mapped.largest is None:
+        return mapped
+    model = copy.deepcopy(mapped.largest)
+    database = pycolmap.Database.open(database_path)
+    try:
+        options = _incremental_options(threads, seed, relaxed=False, fixed_intrinsics=False)
+        steps = _Steps(count, on_progress, on_model)
+        IncrementalMapping(database, options, steps, cancelled).extended(model)
+    finally:
+        database.close()
+    return replace(mapped, models=(model, *mapped.models[1:]))
+
+
+class _Steps:
+    """Reports the steps of an incremental mapping."""
+
+    def __init__(
+        self,
+        count: int,
+        on_progress: Callable[[int, int, str], None],
+        on_model: Callable[[pycolmap.Reconstruction], None],
+    ) -> None:
+        self._count, self._on_progress, self._on_model = count, on_progress, on_model
+        self._placed = 0
+
+    def __call__(self, model: pycolmap.Reconstruction, next_step: str) -> None:
+        # Further models begin with two photos; the progress is that of the largest.
+        self._placed = max(self._placed, model.num_reg_images())
+        self._on_progress(self._placed, self._count, next_step or "photos placed")
+        if model.num_reg_images() > 0:
+            self._on_model(model)
+
+
+def _global_models(
+    database: pycolmap.Database,
+    options: pycolmap.GlobalPipelineOptions,
+    count: int,
+    on_progress: Callable[[int, int, str], None],
+    cancelled: Callable[[], bool],
+) -> list[pycolmap.Reconstruction]:
+    manager = pycolmap.ReconstructionManager()
+    started = reported = time.monotonic()
+
+    def observe() -> None:
+        nonlocal reported
+        if (now := time.monotonic()) >= reported + GLOBAL_REPORT_SECONDS:
+            reported = now
+            on_progress(0, count, f"placing all photos at once, for {now - started:.0f} s")
+
+    watched(lambda _: pycolmap.GlobalPipeline(options, database, manager).run(), cancelled, observe)
+    return [manager.get(index) for index in range(manager.size())]
+
+
+def _size(model: pycolmap.Reconstruction) -> tuple[int, int]:
+    """Sorts the largest first."""
+    return -model.num_reg_images(), -model.num_points3D()
 
 
 def merge_models(

@@ -142,6 +142,7 @@ def preemptive_matches(
     if count <= PREEMPTIVE_EXHAUSTIVE_UP_TO:
         candidates = set(exhaustive(count))
     else:
+        on_progress(0, count * PREEMPTIVE_PARTNERS)
         candidates = _most_similar(features, PREEMPTIVE_PARTNERS) | likely
     return matches_of_largest(candidates, features, pool, on_progress, cancelled)
 

@@ -131,7 +131,7 @@ def match_pairs(
             cameras[first], features[first].points, cameras[second], features[second].points, matches, options
         )
 
-    for done, (pair, (matches, geometry)) in enumerate(zip(fresh, pool.map(work, fresh), strict=True), 1):
+    for pair, (matches, geometry) in zip(fresh, pool.map(work, fresh), strict=True):
         stop_if(cancelled)
         first, second = ids[pair[0]], ids[pair[1]]
         if not database.exists_matches(
@@ -142,8 +142,7 @@ def match_pairs(
             geometry = pycolmap.TwoViewGeometry()
         database.write_two_view_geometry(first, second, geometry)
         found[pair] = TwoView(len(matches), len(geometry.inlier_matches), int(geometry.config))
-        if done % 16 == 0 or done == len(fresh):
-            on_progress(len(found), len(ordered))
+        on_progress(len(found), len(ordered))
     return found
 
 

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.scene import Camera, Source, View
-from splatmill_worker.sfm.callbacks import OnProgress, native_token
+from splatmill_worker.sfm.callbacks import OnProgress, watched
 from splatmill_worker.sfm.features import Features
 from splatmill_worker.sfm.matching import overlap, pairs, two_view
 from splatmill_worker.sfm.options import Effort, fitted
@@ -185,8 +185,12 @@ def _triangulate(
     options.random_seed = seed
     options.extract_colors = False
     options.triangulation.ignore_two_view_tracks = views > 2
-    with native_token(cancelled) as token:
-        pycolmap.triangulate_points(model, database, folder, folder, True, options, False, token)
+    watched(
+        lambda token: pycolmap.triangulate_points(
+            model, database, folder, folder, True, options, False, token
+        ),
+        cancelled,
+    )
     least = min(views, MIN_VIEWS_OF_TRACK)
     for number in [number for number, point in model.points3D.items() if point.track.length() < least]:
         model.delete_point3D(number)
