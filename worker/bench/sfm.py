@@ -8,6 +8,8 @@ A row that is there is not measured again, unless by --again; without a training
 Rules: photos come from ../shared/data, and a scene that is not there gets no row; every run starts from an empty
 folder; a failed run gets no point in the figure and is named in the table. A row during which other programs took
 more than a tenth of the machine's time is marked "busy": its seconds are too high and its PSNR too low.
+With --growth, "report" is the longest time between two reports of progress, and GB the largest resident memory of the
+process so far; counts are measured in the order in which they are given.
 Pose errors are medians after the best similarity to the reference: for fox COLMAP's model of the full-size photos
 (itself no truth: its principal point was held), for generated photos the true cameras, for lund the GPS places (10 m
 accurate), positions only. beer has none: in the COLMAP model that came with it, the camera turns by 167 to 174 degrees
@@ -22,9 +24,10 @@ import argparse
 import hashlib
 import json
 import math
+import resource
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -72,13 +75,27 @@ class Result:
     facts: dict[str, Any]
 
 
+class Waits:
+    """The longest time, in seconds, between two reports of progress, from the start on."""
+
+    def __init__(self) -> None:
+        self.last, self.longest = time.perf_counter(), 0.0
+
+    def __call__(self, stage: str, done: int, total: int, note: str) -> None:
+        now = time.perf_counter()
+        self.longest, self.last = max(self.longest, now - self.last), now
+
+
 def ours(options: sfm.SfmOptions) -> Callable[[Path, Path], Result]:
     def run(images: Path, workdir: Path) -> Result:
+        waits = Waits()
         try:
-            scene = sfm.reconstruct(images, None, workdir, options, lambda *_: None, lambda: False)
+            scene = sfm.reconstruct(images, None, workdir, options, waits, lambda: False)
         except sfm.SfmFailed as failed:
             return Result(None, failed.code, {}, failed.facts)
-        return Result(scene, None, scene.facts["seconds"], scene.facts)
+        return Result(
+            scene, None, scene.facts["seconds"], scene.facts | {"longest_wait": round(waits.longest, 2)}
+        )
 
     return run
 
@@ -261,6 +278,8 @@ def measure(
             "reprojection_pixels": result.facts.get("reprojection_pixels"),
             "effort": result.facts.get("effort"),
             "mapper": result.facts.get("mapper"),
+            "longest_wait": result.facts.get("longest_wait"),
+            "peak_bytes": 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
         }
         if result.scene is not None:
             row |= pose_error(result.scene, truth) | gps_error(result.scene, images, Path(folder) / "look")
@@ -324,7 +343,16 @@ def exponent(rows: list[Row], key: str = "cpu_seconds") -> float:
     return float(np.polyfit(photos, np.log([row[key] for row in rows]), 1)[0])
 
 
-def table(rows: list[Row]) -> str:
+def growth_table(rows: list[Row]) -> str:
+    """The table with what grows beside the seconds."""
+
+    def gigabytes(row: Row) -> str:
+        return f"{row['peak_bytes'] / 1e9:.2f}" if "peak_bytes" in row else ""
+
+    return table(rows, [("report, s", lambda row: row.get("longest_wait", "")), ("GB", gigabytes)])
+
+
+def table(rows: list[Row], more: Sequence[Column] = ()) -> str:
     def of_field(name: str) -> Callable[[Row], object]:
         return lambda row: "" if row.get(name) is None else row[name]
 
@@ -333,7 +361,7 @@ def table(rows: list[Row]) -> str:
         ("outcome", "{outcome}"), ("s", lambda row: f"{row['seconds']}{' (busy)' * row['busy']}"),
         ("CPU s", "{cpu_seconds}"), ("points", "{points}"), ("reproj. px", of_field("reprojection_pixels")),
         ("rotation °", of_field("rotation_deg")), ("position %", of_field("position_percent")),
-        ("GPS m", of_field("gps_metres")), ("PSNR dB", of_field("psnr")),
+        ("GPS m", of_field("gps_metres")), ("PSNR dB", of_field("psnr")), *more,
     ]  # fmt: skip
     return of_rows(columns, rows)
 
@@ -413,7 +441,7 @@ GROWTH = Study(
     cases={"growth": growth_bench},
     key=("scene", "setting"),
     order=lambda row: row["photos"],
-    blocks={"table": table, "footer": _rows.footer, "fit": fit},
+    blocks={"table": growth_table, "footer": _rows.footer, "fit": fit},
     figures={"sfm_growth": growth_figure},
     options={"counts": {"nargs": "+", "type": int, "default": COUNTS}, "again": AGAIN},
 )
