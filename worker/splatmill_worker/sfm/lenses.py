@@ -13,7 +13,7 @@ from splatmill_worker.colmap import pycolmap
 from splatmill_worker.sfm.cameras import CameraGroup
 from splatmill_worker.sfm.checks import RELIABLE_OBSERVED
 from splatmill_worker.sfm.features import photo_index
-from splatmill_worker.sfm.mapping.adjust import Deviations, bundle_adjust
+from splatmill_worker.sfm.mapping.adjust import Deviations, bundle_adjust, median_error
 from splatmill_worker.sfm.mapping.registered import registered
 
 LEAST_STEP = 0.01
@@ -134,7 +134,7 @@ def _second_lens(
     old_id = next(model.images[image_id].camera_id for image_id, photo in photo_of.items() if photo in second)
     new_id = max(model.cameras) + 1
     model.update_point_3d_errors()
-    single = float(np.median([point.error for point in model.points3D.values()]))
+    single = median_error(model)
     for _ in range(ROUNDS):
         images = {image_id for image_id, photo in photo_of.items() if photo in second}
         trial = registered(model, new_id, images)

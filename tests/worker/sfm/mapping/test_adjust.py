@@ -76,3 +76,13 @@ def test_photos_that_are_not_registered_are_left_out() -> None:
     adjusted = adjust_with_lenses(model, {1: FOCAL}, 1, lambda: False)
     assert adjusted.model.num_reg_images() == adjusted.model.num_images() == 35
     assert adjusted.model.cameras[1].model.name == "OPENCV"
+
+
+def test_a_model_that_has_lost_all_points_is_adjusted_to_nothing() -> None:
+    model = model_of(ball, FOCAL)
+    for number in list(model.points3D):
+        model.delete_point3D(number)
+    assert adjust.median_error(model) == np.inf
+    adjusted = adjust_with_lenses(model, {1: FOCAL}, 1, lambda: False)
+    assert adjusted.assumed == {1}
+    assert adjusted.model.cameras[1].focal_length == pytest.approx(FOCAL)

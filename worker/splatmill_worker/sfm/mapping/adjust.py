@@ -110,6 +110,11 @@ def iterations_at_once(model: pycolmap.Reconstruction, most: int) -> int:
     return min(most, max(LEAST_ITERATIONS, ITERATED_OBSERVATIONS // observations))
 
 
+def median_error(model: pycolmap.Reconstruction) -> float:
+    """Median over the points of the mean reprojection error that they hold, in pixels; infinite without points."""
+    return float(np.median([point.error for point in model.points3D.values()] or [math.inf]))
+
+
 def _well_observed(model: pycolmap.Reconstruction) -> set[int]:
     """SIMPLE_RADIAL cameras with enough photos and observations for OPENCV's distortion (decisions: OPENCV_CAMERAS)."""
     photos: dict[int, int] = {}
@@ -140,7 +145,7 @@ class Deviations:
     """Standard deviations of the lens parameters in a bundle adjustment.
 
     covariance: of residuals of one pixel; None where it is singular.
-    error: median over the points of the mean reprojection error, in pixels.
+    error: median over the points of the mean reprojection error, in pixels; infinite without points.
     """
 
     covariance: pycolmap.BACovariance | None
@@ -150,7 +155,7 @@ class Deviations:
     def of(model: pycolmap.Reconstruction, adjuster: pycolmap.CeresBundleAdjuster) -> Deviations:
         """The standard deviations at the solution that `adjuster` has found for `model`."""
         covariance = pycolmap.estimate_ba_covariance(pycolmap.BACovarianceOptions(), model, adjuster)
-        return Deviations(covariance, float(np.median([point.error for point in model.points3D.values()])))
+        return Deviations(covariance, median_error(model))
 
     def stretch_is_determined(self, camera: pycolmap.Camera) -> bool:
         """Whether the ratio fx / fy of an OPENCV camera is known to STRETCH_PIXELS."""
