@@ -5,6 +5,7 @@ checked in the transaction that inserts the job: that nothing it needs is being 
 its owner has.
 """
 
+import math
 from collections.abc import Sequence
 from contextlib import nullcontext
 from typing import cast
@@ -14,11 +15,22 @@ import redis
 from splatmill.backplane import keys
 from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.storage import Storage
-from splatmill.schema import PHOTO_SUFFIXES, BinKind, CreateJob, Job, Role, StoredKind, TrainOptions
+from splatmill.schema import (
+    PHOTO_SUFFIXES,
+    BinKind,
+    CreateJob,
+    EstimateJob,
+    Job,
+    Role,
+    StoredKind,
+    TrainOptions,
+)
 from splatmill.schema.files.formats import is_start_file
 from splatmill_server.access.caller import Caller
 from splatmill_server.base.problems import ProblemError
 from splatmill_server.captures.records import Captures
+from splatmill_server.jobs.estimate import least_within
+from splatmill_server.jobs.finished import Finished
 from splatmill_server.jobs.records import Jobs, job_not_found
 from splatmill_server.models import Models
 from splatmill_server.space.bin import Bin
@@ -38,6 +50,7 @@ class Admission:
         models: Models,
         quota: Quota,
         records_bin: Bin,
+        finished: Finished,
     ) -> None:
         self.storage = storage
         self.captures = captures
@@ -45,6 +58,7 @@ class Admission:
         self.models = models
         self.quota = quota
         self.bin = records_bin
+        self.finished = finished
 
     def create(
         self, who: Caller, request: CreateJob, *, key: str | None = None, body: str = ""
@@ -59,7 +73,7 @@ class Admission:
         is_new = known is None or self.jobs.get_owner(known) is None
         if is_new:
             self.captures.check_visible(who, request.capture)
-            self._check_trainable(request.capture)
+            self._check_trainable(request.capture, request.options)
             self._check_start(who, request)
         needs = needs_of(request.capture, request.options)
 
@@ -114,8 +128,10 @@ class Admission:
         if options.start_model is not None:
             self.bin.take_out(BinKind.job, options.start_model)
 
-    def _check_trainable(self, capture_id: str) -> None:
-        """Raise a 404 or 422 problem for a capture that certainly cannot be trained: it has no photos, or only one."""
+    def _check_trainable(self, capture_id: str, options: TrainOptions) -> None:
+        """Raise a 404 or 422 problem for a capture that certainly cannot be trained: it has no photos or only one, or
+        more than the jobs that have finished here could train in the time of the options.
+        """
         self.captures.get(capture_id)
         images = list(self.storage.entries(layout.capture_files(capture_id, Role.images)))
         if not images:
@@ -136,6 +152,19 @@ class Admission:
                 "two thirds.",
                 facts={"images": 1},
             )
+        if options.within is not None and photos:
+            request = EstimateJob(photos=len(images), posed=posed, options=options)
+            recovered = next(iter(self.storage.walk(layout.capture_sfm(capture_id))), None) is not None
+            least = least_within(request, self.finished.newest(), recovered=recovered)
+            if least is not None and options.within < least:
+                raise ProblemError(
+                    "option_out_of_range",
+                    f"within is {options.within:g} s; the fastest of the jobs that have finished here and are most "
+                    f"alike would take {least:.0f} s for the cameras of {len(images)} photos, one step on each, and "
+                    "the files.",
+                    advice=f"Set within to {math.ceil(least)} s or more, or give fewer photos.",
+                    facts={"images": len(images)},
+                )
 
     def _check_start(self, who: Caller, request: CreateJob) -> None:
         """Raise a problem if the model to start from, where the request names one, is not there for the caller."""

@@ -140,6 +140,7 @@ class Service:
         redis_async = connect_async(settings.redis_url)
         connection = connect(settings.redis_url, timeout=settings.redis_timeout, retries=1)
         lists = Lists(connection)
+        finished = Finished(storage, lists)
         jobs = Jobs(connection, storage, metrics, lists)
         models = Models(storage, jobs, lists)
         captures = Captures(storage, settings, metrics, lists)
@@ -172,7 +173,7 @@ class Service:
             deliveries=Deliveries(connection, webhooks, outgoing, metrics),
             jobs=jobs,
             lists=lists,
-            finished=Finished(storage, lists),
+            finished=finished,
             models=models,
             shares=Shares(storage, connection, models),
             conversions=Conversions(storage, connection, models, renderer, quota, settings.orbit_timeout),
@@ -188,7 +189,7 @@ class Service:
             ends=Ends(redis_async, jobs),
             usage=usage,
             quota=quota,
-            admission=Admission(storage, captures, jobs, models, quota, records_bin),
+            admission=Admission(storage, captures, jobs, models, quota, records_bin, finished),
             deletion=deletion,
             bin=records_bin,
             relisting=Relisting(connection, storage, captures, models, settings.reaper_interval),

@@ -354,7 +354,7 @@ def test_settings_have_the_help_of_the_command_line_and_errors_beside_them(
     for option in describe_options():
         help_text = page.locator(f"#option-{option.name}-help")
         expect(help_text).to_contain_text(option.help.replace("image_size", '"Image size"'))
-        shown = option.name in ("preset", "time_budget", "image_size")
+        shown = option.name in ("preset", "within", "time_budget", "image_size")
         assert help_text.is_visible() == shown, option.name
     size = page.locator("#option-image_size")
     size.fill("5")

@@ -48,9 +48,9 @@ from splatmill_worker.render_service import edit
 from splatmill_worker.service import redis_patience, rq_worker
 from splatmill_worker.service.attempts import mirror
 from splatmill_worker.sfm import checks
-from splatmill_worker.splat.plan import photos
+from splatmill_worker.splat.plan import evaluated, photos
 from splatmill_worker.splat.report import report
-from splatmill_worker.splat.train import disagreement, evaluations
+from splatmill_worker.splat.train import disagreement
 from tests.support.paths import ROOT
 
 WORDS = (
@@ -180,15 +180,15 @@ SENTENCES: list[tuple[str, Callable[[], str]]] = [
     (
         "report",
         lambda: (
-            f"at most {len(evaluations.EVALUATED_AT)} in a run, and {len(evaluations.SHORT_EVALUATED_AT)} in a short"
+            f"at most {len(evaluated.EVALUATED_AT)} in a run, and {len(evaluated.SHORT_EVALUATED_AT)} in a short"
         ),
     ),
-    ("report", lambda: f"together take at most {share(evaluations.SHARE)} of the training time"),
+    ("report", lambda: f"together take at most {share(evaluated.SHARE)} of the training time"),
     (
         "report",
         lambda: (
-            f"up to {word(evaluations.ALSO_EVALUATED)} of the training photos, at the last dot over "
-            f"{evaluations.FINALLY_EVALUATED} to {2 * evaluations.FINALLY_EVALUATED - 1}"
+            f"up to {word(evaluated.ALSO_EVALUATED)} of the training photos, at the last dot over "
+            f"{evaluated.FINALLY_EVALUATED} to {2 * evaluated.FINALLY_EVALUATED - 1}"
         ),
     ),
     (

@@ -87,6 +87,7 @@ ELSEWHERE = {
             "schedule.budget",
             "steps",
             "time_budget",
+            "within",
             "target_psnr",
             "stops_when_flat",
             "validation",

@@ -128,6 +128,17 @@ class TrainOptions(Request):
         ),
         json_schema_extra=_BUDGET | {"kind": "duration"},
     )
+    within: Duration | None = Field(
+        default=None,
+        ge=5,
+        le=7 * 86400,
+        description=(
+            "Time for the whole job once a worker has begun it: 90s, 5m, 1h30m, or a number of seconds. Training gets "
+            "what the cameras leave of it, less what measuring and storing will take. A time that is too short by the "
+            "jobs that have finished on this server is refused, with the least that is enough."
+        ),
+        json_schema_extra=_BUDGET | {"kind": "duration"},
+    )
     target_psnr: float | None = Field(
         default=None,
         ge=5,
@@ -390,12 +401,20 @@ class TrainOptions(Request):
         """The preset that ends a training without a budget: quality where a target may end it sooner."""
         return self.preset if self.target_psnr is None else Preset.quality
 
+    @property
+    def timed(self) -> bool:
+        """Whether time limits the training."""
+        return self.time_budget is not None or self.within is not None
+
     def doubles(self, photos: int) -> bool:
         """Whether a training on so many photos doubles the steps of its preset while that gains enough: where no budget
         is given, and some of the photos can be set aside to measure it.
         """
-        budgeted = self.steps is not None or self.time_budget is not None
-        return not budgeted and (self.target_psnr is not None or photos >= PHOTOS_PER_VALIDATION)
+        return (
+            self.steps is None
+            and not self.timed
+            and (self.target_psnr is not None or photos >= PHOTOS_PER_VALIDATION)
+        )
 
     def held_out_of(self, photos: int) -> int:
         """How many of so many photos are held out, where none says of itself that it is."""

@@ -31,6 +31,7 @@ class TrainArguments(TypedDict, total=False):
     preset: Preset | Literal["draft", "balanced", "quality"]
     steps: int | None
     time_budget: float | str | None
+    within: float | str | None
     target_psnr: float | None
     max_gaussians: int | None
     max_memory: int | str | None

@@ -38,15 +38,29 @@ def estimate(request: EstimateJob, finished: Sequence[Figures]) -> Estimate:
         for figures in fitting
         if (figures.machine, figures.kernels) == (fitting[0].machine, fitting[0].kernels)
     ]
-    stages = [_cameras(request, here), _training(request, here), _rest(request, here)]
+    cameras, rest = _cameras(request, here), _rest(request, here)
+    stages = [cameras, _training(request, here, cameras, rest), rest]
+    within = request.options.within
     return Estimate(
-        seconds=_sum([stage.seconds for stage in stages]),
-        lowest=_sum([stage.lowest for stage in stages]),
-        highest=_sum([stage.highest for stage in stages]),
+        seconds=_sum([stage.seconds for stage in stages], within),
+        lowest=_sum([stage.lowest for stage in stages], within),
+        highest=_sum([stage.highest for stage in stages], within),
         stages=stages,
         jobs=len(here),
         machine=here[0].machine if here else None,
     )
+
+
+def least_within(request: EstimateJob, finished: Sequence[Figures], *, recovered: bool) -> float | None:
+    """Return the seconds of a whole job below which training would not show each photo once, by the fastest of the
+    finished jobs that are most alike, or None if none is.
+
+    finished: as for `estimate`.
+    recovered: whether the cameras are there from an earlier job.
+    """
+    once = request.options.model_copy(update={"steps": request.photos, "time_budget": None, "within": None})
+    stages = estimate(request.model_copy(update={"options": once}), finished).stages
+    return _sum([stage.lowest for stage in stages if not (recovered and stage.stage == "cameras")], None)
 
 
 def _cameras(request: EstimateJob, here: Sequence[Figures]) -> StageEstimate:
@@ -65,15 +79,20 @@ def _cameras(request: EstimateJob, here: Sequence[Figures]) -> StageEstimate:
     )
 
 
-def _training(request: EstimateJob, here: Sequence[Figures]) -> StageEstimate:
+def _training(
+    request: EstimateJob, here: Sequence[Figures], cameras: StageEstimate, rest: StageEstimate
+) -> StageEstimate:
     options, photos = request.options, request.photos
     trained = max(1, photos - options.held_out_of(photos))
-    steps, limit = (
-        steps_of(options, trained),
-        math.inf if options.time_budget is None else options.time_budget,
-    )
+    steps, limit = steps_of(options, trained), options.time_budget or math.inf
+    because = f"The time budget is {limit:g} s."
+    if options.within is not None:
+        if cameras.seconds is None or rest.seconds is None:
+            return StageEstimate(stage="training", because=f"It gets what is left of {options.within:g} s.")
+        if (left := max(0.0, options.within - cameras.seconds - rest.seconds)) < limit:
+            limit, because = left, f"It gets what is left of {options.within:g} s."
     if steps is None:
-        return _stage("training", [limit], f"The time budget is {limit:g} s.")
+        return _stage("training", [limit], because)
     alike = _nearest(
         here,
         lambda figures: (
@@ -83,9 +102,7 @@ def _training(request: EstimateJob, here: Sequence[Figures]) -> StageEstimate:
         ),
     )
     if not alike and limit < math.inf:
-        return _stage(
-            "training", [limit], f"The time budget is {limit:g} s, and the steps may end it earlier."
-        )
+        return _stage("training", [limit], f"{because} The steps may end it earlier.")
     if not alike:
         return StageEstimate(stage="training", because="No such job has finished on this server yet.")
     each = [figures.train / figures.steps * _size_factor(figures, options) for figures in alike]
@@ -121,7 +138,7 @@ def steps_of(options: TrainOptions, photos: int) -> int | None:
     """Return the number of steps for so many training photos, or None where time limits them."""
     if options.steps is not None:
         return options.steps
-    if options.time_budget is not None:
+    if options.timed:
         return None
     return preset_steps(options.ending, photos)
 
@@ -160,9 +177,11 @@ def _stage(name: str, seconds: Sequence[float], because: str) -> StageEstimate:
     )
 
 
-def _sum(numbers: Sequence[float | None]) -> float | None:
+def _sum(numbers: Sequence[float | None], within: float | None) -> float | None:
     known = [number for number in numbers if number is not None]
-    return round(sum(known), 1) if len(known) == len(numbers) else None
+    if len(known) < len(numbers):
+        return within
+    return round(min(sum(known), math.inf if within is None else within), 1)
 
 
 def _jobs(alike: Sequence[Figures]) -> str:

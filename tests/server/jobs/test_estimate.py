@@ -4,6 +4,7 @@ Not proved here: how close an estimate comes. The records are those of a real jo
 """
 
 import json
+import re
 from typing import Any
 
 import pytest
@@ -12,7 +13,7 @@ from splatmill.backplane import lists
 from splatmill.backplane.jobs.row import now
 from splatmill.backplane.storage import layout
 from splatmill.schema import EstimateJob, TrainOptions
-from splatmill_server.jobs.estimate import estimate
+from splatmill_server.jobs.estimate import estimate, least_within
 from splatmill_server.jobs.finished import Figures, figures
 from tests.support.facts import changed, planned
 from tests.support.formats import V1, job_ids
@@ -96,6 +97,47 @@ def test_a_time_budget_is_the_time_of_the_training() -> None:
     both = {"photos": 20, "options": {"time_budget": "2m", "steps": 1000}}
     assert seconds(both, job())[1] == 20.0
     assert seconds(both)[1] == 120.0
+
+
+def test_training_gets_what_is_left_of_the_time_for_the_whole_job() -> None:
+    request = {"photos": 20, "options": {"within": "2m"}}
+    assert seconds(request, job()) == [10.0, 103.0, 7.0]
+    assert estimate(EstimateJob.model_validate(request), [job()]).seconds == 120.0
+    unknown = estimate(EstimateJob.model_validate(request), [])
+    assert (unknown.stages[1].seconds, unknown.seconds, unknown.highest) == (None, 120.0, 120.0)
+    shorter = {"photos": 20, "options": {"within": "2m", "time_budget": 30}}
+    assert seconds(shorter, job()) == [10.0, 30.0, 7.0]
+    assert seconds({"photos": 20, "options": {"within": "2m", "steps": 1000}}, job())[1] == 20.0
+    assert seconds({"photos": 20, "options": {"within": 10}}, job())[1] == 0.0
+
+
+def test_the_least_time_is_that_of_the_fastest_job_with_a_step_on_each_photo() -> None:
+    request = EstimateJob.model_validate({"photos": 40, "options": {"within": 10, "time_budget": 5}})
+    assert least_within(request, [job(cameras=12.0), job()], recovered=False) == 20.0 + 40 * 0.02 + 9.0
+    assert least_within(request, [job()], recovered=True) == 40 * 0.02 + 9.0
+    assert least_within(request, [], recovered=False) is None
+
+
+def test_a_job_that_cannot_end_in_its_time_is_refused_with_the_least_time(app: ServedApp) -> None:
+    capture = app.capture(*(f"{number}.jpg" for number in range(20)))
+    body = {"capture": capture, "options": {"within": 5}}
+    assert app.http.post("/v1/jobs", json=body).status_code == 202  # nothing is known of this machine yet
+    stored, report = records()
+    report["sfm"] = {"seconds": {"features": 20.0, "matching": 10.5}}
+    report["facts"]["source"] = "sfm"
+    app.service.storage.put(layout.job_record(STORED.name), json.dumps(stored).encode())
+    app.service.storage.put(layout.model_file(STORED.name, "report.json"), json.dumps(report).encode())
+    lists.add_model(app.redis, STORED.name, now(), "default")
+    advice = problem(app.http.post("/v1/jobs", json=body), 422, "option_out_of_range")["advice"]
+    least = int(re.findall(r"within to (\d+) s", advice)[0])
+    assert least > 20 / 8 * 30.5
+    for seconds, status in ((least - 1, 422), (least, 202)):
+        body["options"] = {"within": seconds}
+        assert app.http.post("/v1/jobs", json=body).status_code == status
+    # The cameras of this capture are there now.
+    app.service.storage.put(f"{layout.capture_sfm(capture)}/model/cameras.bin", b"cameras")
+    body["options"] = {"within": round(least - 20 / 8 * 30.5) + 1}
+    assert app.http.post("/v1/jobs", json=body).status_code == 202
 
 
 def test_only_the_share_of_a_step_that_pixels_take_grows_with_them() -> None:

@@ -4,6 +4,7 @@ which mappers are tried.
 Proven on the database of generated photos. Does not prove that a higher effort registers more photos.
 """
 
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext, suppress
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,10 +15,11 @@ import pytest
 
 from splatmill_worker import sfm, synthetic
 from splatmill_worker.colmap import pycolmap
-from splatmill_worker.sfm import effort, features, trials
+from splatmill_worker.sfm import effort, features, options, solve, trials
 from splatmill_worker.sfm.features import FeatureStore
 from splatmill_worker.sfm.mapping import mapper
 from splatmill_worker.sfm.matching import pairs
+from splatmill_worker.sfm.run import SfmRun
 
 pytestmark = pytest.mark.slow
 
@@ -160,3 +162,38 @@ def _tried(
     )  # fmt: skip
     trials.best_mapping(asked, folder / "database.db", verified)
     return calls
+
+
+@pytest.mark.parametrize(
+    ("registered", "spent", "tried"),
+    [
+        (6, 9.0, ["lean", "standard", "high"]),
+        (6, 11.0, ["lean"]),
+        (4, 11.0, ["lean", "standard", "high"]),  # a model of less than half of the photos is no result yet
+        (9, 11.0, ["lean"]),
+    ],
+)
+def test_no_higher_effort_is_tried_where_there_is_no_time_for_it(
+    registered: int, spent: float, tried: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[str] = []
+
+    def solve_at(_run: object, tried_effort: options.Effort, _best: object) -> Any:
+        calls.append(tried_effort.name)
+        return SimpleNamespace(mapped=None, effort=tried_effort, verified=[(0, 1)])
+
+    monkeypatch.setattr(solve, "solve_at", solve_at)
+    monkeypatch.setattr(solve, "registered_counts", lambda _: (registered, registered))
+    monkeypatch.setattr(solve, "unfold", lambda *_: None)
+    prepared: Any = SimpleNamespace(photos=[SimpleNamespace(width=640, height=480)] * 10)
+    asked = sfm.SfmOptions(seconds=40.0)
+    with ThreadPoolExecutor(1) as pool:
+        run = SfmRun(prepared, [], "SIMPLE_RADIAL", asked, tmp_path, 1, pool, lambda *_: None, lambda: False)
+        run.began -= spent
+        solve._solve(run)
+    assert calls == tried
+    assert (
+        run.hurried
+        == any("no time to try standard" in note for note in run.notes)
+        == (spent > 10 and registered == 6)
+    )

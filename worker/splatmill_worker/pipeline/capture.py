@@ -23,6 +23,9 @@ from splatmill_worker.wording import plain
 OnProgress = Callable[[str, int, int, str], None]
 """Called with the stage, the number of steps done, their total (0 if unknown), and a note."""
 
+CAMERAS_SHARE = 0.5
+"""Share of the time of a whole job after which no other way to place more photos is tried."""
+
 
 def posed_scene(
     capture: Path,
@@ -98,6 +101,7 @@ def posed_scene(
         mapper=options.mapper.value,
         frames=options.max_video_frames,
         seed=options.seed,
+        seconds=None if options.within is None else CAMERAS_SHARE * options.within,
     )
     scene = sfm.reconstruct(
         images if images.is_dir() else capture,

@@ -58,6 +58,8 @@ def plan_training(job: Job, cameras: Cameras, revise: Revise, stages: Stages) ->
     with stages.measured("plan"):
         first = first_gaussians(job, cameras, photos)
         facts = _measure_facts(job, cameras, photos, first)
+        if job.options.within is not None:
+            facts = replace(facts, seconds_left=job.options.within - stages.elapsed)
         plan = _make_plan(job, facts, revise)
     smaller = plan.image_size < max(facts.width, facts.height)
     return Planned(first, facts, plan, None if smaller else _in_light(photos, facts, plan), room)

@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import psutil
+
 from splatmill.files import atomic_write
 
 log = logging.getLogger("splatmill_worker")
@@ -27,6 +29,13 @@ class Stages:
                 }
             except (ValueError, TypeError, AttributeError) as error:
                 log.warning("The times of earlier attempts are not readable and count as 0: %s", error)
+
+        self._earlier = sum(self.seconds.values())
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds since this process began, and those of the stages of earlier attempts."""
+        return self._earlier + time.time() - psutil.Process().create_time()
 
     @contextmanager
     def measured(self, stage: str) -> Iterator[None]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 
@@ -20,6 +20,8 @@ class SfmOptions:
     stereo: whether stereo adds points where there are few.
     seed: of every random choice.
     threads: CPU threads; None: one per core.
+    seconds: time for the cameras, None without a limit: no effort is tried after one that has placed half of the photos
+        if it would take longer. Not in the `repr`, by which results are kept.
     """
 
     effort: Literal["auto", "lean", "standard", "high"] = "auto"
@@ -32,6 +34,7 @@ class SfmOptions:
     stereo: bool = True
     seed: int = 0
     threads: int | None = None
+    seconds: float | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,9 @@ LEAN = Effort("lean", side=800, features=1500, first_octave=0, orientations=1, p
 STANDARD = Effort("standard", side=800, features=2500, first_octave=-1, orientations=1, partners=10)
 HIGH = Effort("high", side=1400, features=6000, first_octave=-1, orientations=2, partners=16)
 EFFORTS = {effort.name: effort for effort in (LEAN, STANDARD, HIGH)}
+
+NEXT_EFFORT = 3.0
+"""Time of an effort over that of all before it: STANDARD's features take four times those of LEAN, and mapping less."""
 
 SMALL_SIDE = 700
 """Longest side, in pixels, up to which SIFT doubles the size of photos at any effort: small photos have few features,

@@ -79,6 +79,8 @@ class SfmRun:
     seconds: time spent so far, by stage.
     notes: sentences for the user.
     best_mapper: the mapper that registered the most photos so far.
+    began: when, by the monotonic clock.
+    hurried: whether an effort was left out because there was no time for it.
     """
 
     prepared: Prepared
@@ -95,6 +97,13 @@ class SfmRun:
     notes: list[str] = field(default_factory=list)
     best_mapper: mapper.Mapper | None = None
     observer: PlacingObserver | None = None
+    began: float = field(default_factory=time.monotonic)
+    hurried: bool = False
+
+    def has_time_for(self, times: float) -> bool:
+        """Whether something that takes `times` the time since the run began would end in the time for the cameras."""
+        limit = self.options.seconds
+        return limit is None or (1.0 + times) * (time.monotonic() - self.began) <= limit
 
     @property
     def count(self) -> int:

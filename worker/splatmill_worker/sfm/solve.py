@@ -23,7 +23,16 @@ from splatmill_worker.sfm.callbacks import OnProgress, stop_if
 from splatmill_worker.sfm.effort import solve_at
 from splatmill_worker.sfm.final_model import final_model
 from splatmill_worker.sfm.model_store import is_stored, load_model, store_model
-from splatmill_worker.sfm.options import EFFORTS, HIGH, LEAN, STANDARD, Effort, SfmOptions, fitted
+from splatmill_worker.sfm.options import (
+    EFFORTS,
+    HIGH,
+    LEAN,
+    NEXT_EFFORT,
+    STANDARD,
+    Effort,
+    SfmOptions,
+    fitted,
+)
 from splatmill_worker.sfm.placed import PlacingObserver
 from splatmill_worker.sfm.run import VERSION, EffortResult, SfmRun, digest, torch_threads
 from splatmill_worker.sfm.trials import ENOUGH_REGISTERED, registered_counts
@@ -84,8 +93,11 @@ def reconstruct_photos(
     require_photos(known, [photo.name for photo in prepared.photos])
     stop_if(cancelled)
     folder = workdir / "sfm" / prepared.key[:24]
-    stored = folder / f"model-{digest(VERSION, stereo.VERSION, pycolmap.__version__, options)}"
-    if is_stored(stored):
+    whole = folder / f"model-{digest(VERSION, stereo.VERSION, pycolmap.__version__, options)}"
+    hurried = whole.with_name(f"{whole.name}-hurried")
+    for stored in [whole] if options.seconds is None else [whole, hurried]:
+        if not is_stored(stored):
+            continue
         try:
             return load_model(prepared, stored, known)
         except (OSError, ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
@@ -100,7 +112,9 @@ def reconstruct_photos(
     with ThreadPoolExecutor(threads) as pool, torch_threads(1):
         run = SfmRun(prepared, groups, model, options, folder, threads, pool, on_progress, cancelled)
         run.observer = observer
-        store_model(run, final_model(run, _solve(run)), stored)
+        final = final_model(run, _solve(run))
+        stored = hurried if run.hurried else whole
+        store_model(run, final, stored)
     return load_model(prepared, stored, known)
 
 
@@ -152,6 +166,13 @@ def _solve(run: SfmRun) -> EffortResult:
     longest = int(np.median([max(photo.width, photo.height) for photo in run.prepared.photos]))
     for effort in _efforts(run.options, longest):
         if best is not None:
+            if 2 * best_counts[0] >= run.count and not run.has_time_for(NEXT_EFFORT):
+                run.hurried = True
+                run.notes.append(
+                    f"{best_counts[0]} of {run.count} photos were placed reliably with {best.effort.name} effort. "
+                    f"There was no time to try {effort.name} effort."
+                )
+                break
             run.notes.append(
                 f"{best_counts[0]} of {run.count} photos were placed reliably with {best.effort.name} effort; "
                 f"{effort.name} effort was tried next."

@@ -1,4 +1,4 @@
-"""The best of up to three mappings of the same view graph, and one that goes on with more pairs."""
+"""The best of up to three mappings of the same view graph, and one that more pairs add photos to."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ def test_lpips_is_left_out_with_its_reason() -> None:
     missing = planned(changed(no_lpips="The weights are not installed."))
     assert (missing.lpips, missing.left_out["lpips"]) == (False, "The weights are not installed.")
     assert "there are none" in planned(changed(held_out=0)).left_out["lpips"]
-    assert "time budget" in planned(changed(), time_budget=10).left_out["lpips"]
+    assert "time is limited" in planned(changed(), time_budget=10).left_out["lpips"]
     assert planned(changed(), time_budget=10, lpips="on").lpips
     off = planned(changed(), lpips="off")
     assert (off.lpips, off.left_out["lpips"]) == (False, "Set by an option.")

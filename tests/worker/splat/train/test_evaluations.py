@@ -10,8 +10,7 @@ import pytest
 from splatmill.schema import TrainOptions
 from splatmill_worker.splat.engine.open import open_engine
 from splatmill_worker.splat.plan.decide import decide
-from splatmill_worker.splat.start.points import from_points
-from splatmill_worker.splat.train.evaluations import (
+from splatmill_worker.splat.plan.evaluated import (
     EVALUATED_AT,
     SHARE,
     SHORT_EVALUATED_AT,
@@ -20,6 +19,7 @@ from splatmill_worker.splat.train.evaluations import (
     evenly,
     finally_evaluated,
 )
+from splatmill_worker.splat.start.points import from_points
 from splatmill_worker.splat.train.loop import train
 from tests.support import still_life
 from tests.support.facts import FACTS

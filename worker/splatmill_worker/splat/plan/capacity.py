@@ -17,6 +17,7 @@ from splatmill.schema import (
 )
 from splatmill_worker.kernels.gpu.device import largest_budget
 from splatmill_worker.splat.plan.budget import Budget
+from splatmill_worker.splat.plan.deadline import training_seconds
 from splatmill_worker.splat.plan.facts import Facts, Speed
 from splatmill_worker.splat.plan.needs import HALF_TURN
 from splatmill_worker.splat.plan.photos import least_gain
@@ -135,8 +136,8 @@ def _budget(
     facts: Facts, options: TrainOptions, step: float
 ) -> tuple[Decision[Budget], Decision[int], int | None]:
     """The budget, the number of steps that it is expected to allow, at `step` seconds each, and the longest."""
-    if options.time_budget is not None:
-        return *_time_budget(facts, options, options.time_budget, step), None
+    if options.timed:
+        return *_time_budget(facts, options, step), None
     if options.steps is not None:
         because = f"The option steps asks for {options.steps} steps."
         return by_option(Budget(options.steps)), Decision(options.steps, because), None
@@ -151,13 +152,13 @@ def _budget(
     return Decision(Budget(steps), given), Decision(steps, takes), longest
 
 
-def _time_budget(
-    facts: Facts, options: TrainOptions, seconds: float, step: float
-) -> tuple[Decision[Budget], Decision[int]]:
+def _time_budget(facts: Facts, options: TrainOptions, step: float) -> tuple[Decision[Budget], Decision[int]]:
+    seconds, given = training_seconds(facts, options, step)
     affordable = max(1, int(seconds / step))
     steps = affordable if options.steps is None else min(affordable, options.steps)
-    because = f"{seconds:g} s at {1e3 * step:.1f} ms a step allow about {affordable} steps" + (
-        "." if steps == affordable else f", of which the option steps asks for {steps}."
+    because = (
+        f"{given[0].upper()}{given[1:]} at {1e3 * step:.1f} ms a step allow about {affordable} steps"
+        + ("." if steps == affordable else f", of which the option steps asks for {steps}.")
     )
     few = PRESET_VISITS[Preset.draft]
     if steps < few * facts.views:

@@ -216,7 +216,7 @@ def _annealing(facts: Facts, options: TrainOptions, steps: int) -> Decision[Anne
         f"For {steps} steps, squared gradients are averaged over {averaged} of them, and learning "
         f"rates are {boost:.1f} times those of a run of {PAPER_STEPS} steps"
     )
-    if options.time_budget is not None:
+    if options.timed:
         because += "; the factor follows the number of steps that the time allows"
     hold = _hold(facts, steps)
     if hold < Annealing.hold:
@@ -224,9 +224,7 @@ def _annealing(facts: Facts, options: TrainOptions, steps: int) -> Decision[Anne
             f". With {facts.views} photos, none is set aside to watch for over-fitting, so the rates fall from the "
             f"{MANY_VISITS}th step on each"
         )
-    return Decision(
-        Annealing(boost=boost if options.time_budget is None else None, hold=hold, beta2=beta2), f"{because}."
-    )
+    return Decision(Annealing(boost=None if options.timed else boost, hold=hold, beta2=beta2), f"{because}.")
 
 
 def _hold(facts: Facts, steps: int) -> float:

@@ -114,6 +114,7 @@ class Facts:
     no_points: why a posed scene has no points, a sentence; None where it has some.
     photo_bytes: size of all loaded photos, held-out ones included, with a mask or alpha for each; None: not known.
     photos_on_disk: whether they were loaded into files, since that is more than photos may take of the memory.
+    seconds_left: what the job has left of the option `within` when the plan is made; None without that option.
     no_lpips: why LPIPS cannot be measured here, a sentence; None where it can.
     """
 
@@ -142,6 +143,7 @@ class Facts:
     no_hull: str | None = None
     photo_bytes: int | None = None
     photos_on_disk: bool = False
+    seconds_left: float | None = None
     no_lpips: str | None = None
 
     @property

@@ -13,9 +13,9 @@ def decide_lpips(facts: Facts, options: TrainOptions) -> Decision[bool]:
         return Decision(False, facts.no_lpips)
     if not facts.held_out:
         return Decision(False, "LPIPS is measured on held-out photos, and there are none.")
-    if options.lpips is Switch.auto and options.time_budget is not None:
+    if options.lpips is Switch.auto and options.timed:
         return Decision(
-            False, "LPIPS takes a second and more of each photo; with a time budget, lpips has to be on."
+            False, "LPIPS takes a second and more of each photo; where time is limited, lpips has to be on."
         )
     because = (
         f"The weights of LPIPS are installed; it is measured on {facts.held_out} held-out photos at the end."

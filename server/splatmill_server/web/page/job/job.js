@@ -319,12 +319,12 @@ function facts() {
   const rows = [["Created", moment(job.created_at)]];
   if (job.attempt > 1) rows.push(["Attempt", number(job.attempt)]);
   const set = Object.entries(job.options).filter(([, value]) => value !== null && value !== "auto");
-  const said = ["preset", "time_budget", "steps", "max_gaussians", "image_size", "backend"];
+  const said = ["preset", "within", "time_budget", "steps", "max_gaussians", "image_size", "backend"];
   for (const name of said) {
     const setting = set.find(([key]) => key === name);
     if (!setting) continue;
     const [, value] = setting;
-    rows.push([name.replaceAll("_", " "), name === "time_budget" ? seconds(value) : typeof value === "number" ? number(value) : String(value)]);
+    rows.push([name.replaceAll("_", " "), name === "time_budget" || name === "within" ? seconds(value) : typeof value === "number" ? number(value) : String(value)]);
   }
   if (report?.peak_memory) rows.push(["Memory", `${bytes(report.peak_memory)} at most`]);
   rows.push(["Capture", h("code", {}, job.capture)]);

@@ -16,7 +16,7 @@ import { number } from "../format.js";
  */
 
 /** The settings that are shown at first. */
-const FIRST = ["preset", "time_budget", "image_size"];
+const FIRST = ["preset", "within", "time_budget", "image_size"];
 
 /** The titles of the groups, as on the command line. */
 const GROUPS = { budget: "Length and size of the training", photos: "Photos", cameras: "Recovering the cameras", engine: "Engine" };
