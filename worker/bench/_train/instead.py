@@ -19,10 +19,10 @@ from splatmill_worker.splat.engine.open import gaussians_of
 from splatmill_worker.splat.engine.protocol import Engine
 from splatmill_worker.splat.evaluate import evaluate
 from splatmill_worker.splat.gaussians import Gaussians
+from splatmill_worker.splat.plan.evaluated import finally_evaluated
 from splatmill_worker.splat.plan.facts import Facts
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.train.disagreement import Disagreement, disagreements
-from splatmill_worker.splat.train.evaluations import finally_evaluated
 from splatmill_worker.splat.train.loop import Trained, train
 from splatmill_worker.splat.train.renderer import evaluation_background, renderer
 from splatmill_worker.splat.train.run import TrainingRun

@@ -35,7 +35,7 @@ class Stages:
     @property
     def elapsed(self) -> float:
         """Seconds since this process began, and those of the stages of earlier attempts."""
-        return self._earlier + time.time() - psutil.Process().create_time()
+        return self._earlier + time.time() - float(psutil.Process().create_time())
 
     @contextmanager
     def measured(self, stage: str) -> Iterator[None]:

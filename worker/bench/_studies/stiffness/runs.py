@@ -18,9 +18,9 @@ from splatmill_worker.pipeline.training import EXTENT
 from splatmill_worker.splat.engine.cpu import CpuEngine
 from splatmill_worker.splat.engine.protocol import Engine
 from splatmill_worker.splat.gaussians import Gaussians
+from splatmill_worker.splat.plan.evaluated import evenly
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.plan.rates import RateSchedule
-from splatmill_worker.splat.train.evaluations import evenly
 from splatmill_worker.splat.train.loop import Hooks, Trained, train
 from splatmill_worker.splat.train.run import TrainingRun
 

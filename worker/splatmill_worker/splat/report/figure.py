@@ -122,11 +122,13 @@ def _line(axes: Axes, x: Sequence[float], y: Sequence[float], color: str = ERROR
 
 def _rms(psnr: npt.ArrayLike) -> npt.NDArray[np.float64]:
     """Root mean square of an error, in grey levels of 255, by its PSNR in dB."""
-    return 255.0 * np.power(10.0, -np.asarray(psnr) / 20.0)
+    rms: npt.NDArray[np.float64] = 255.0 * np.power(10.0, -np.asarray(psnr, np.float64) / 20.0)
+    return rms
 
 
 def _decibels(rms: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    return -20.0 * np.log10(np.maximum(np.asarray(rms), 1e-9) / 255.0)
+    psnr: npt.NDArray[np.float64] = -20.0 * np.log10(np.maximum(np.asarray(rms, np.float64), 1e-9) / 255.0)
+    return psnr
 
 
 def _logarithmic(axes: Axes, which: Literal["x", "y"]) -> None:
