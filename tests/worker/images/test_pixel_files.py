@@ -129,20 +129,22 @@ def test_what_the_system_has_written_out_is_read_ahead(tmp_path: Path) -> None:
 
 
 MEASURED = """
-import ctypes, json, os, sys
+import json, os, sys
 from pathlib import Path
 from splatmill_worker import memory
+from splatmill_worker.__main__ import return_freed_memory
 from splatmill_worker.images.load import load_views
 from splatmill_worker.images.pixel_files import PixelFiles
 from tests.worker.images.test_pixel_files import CAMERA, frozen
 
-mmap_threshold = -3
-ctypes.CDLL(None).mallopt(mmap_threshold, 2**20)  # what loading frees leaves no pieces in the heap
+return_freed_memory()
 folder, place = Path(sys.argv[1]), sys.argv[2]
 photos = frozen(folder)
 load_views(photos[:8], 1200, threads=1)
+memory.return_freed()
 before = sum(memory._memory_of(os.getpid()))
 loaded = load_views(photos, 1200, threads=1, files=PixelFiles(folder) if place == "files" else None)
+memory.return_freed()
 taken = sum(memory._memory_of(os.getpid())) - before
 print(json.dumps([taken, sum(photo.rgb.nbytes for photo in loaded), int(sum(int(p.rgb.sum()) for p in loaded))]))
 """
@@ -157,7 +159,7 @@ def frozen(folder: Path) -> list[View]:
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is read from /proc")
 def test_photos_in_files_take_no_memory(tmp_path: Path) -> None:
-    """194 MB of photos, which take as much in memory. The heap, which may stay in pieces, is kept out of it."""
+    """194 MB of photos, which take as much in memory, and leave nothing in the heap."""
     random = np.random.default_rng(0)
     Image.fromarray(random.integers(256, size=(900, 1200, 3), dtype=np.uint8)).save(tmp_path / "one.jpg")
     found = {}

@@ -70,7 +70,11 @@ class Room:
 
 
 def load_photos(cameras: Cameras, size: int, room: Room) -> Photos:
-    """All photos, undistorted, with `size` pixels at most on the longer side; in files where `room` is too small."""
+    """All photos, undistorted, with `size` pixels at most on the longer side; in files where `room` is too small.
+
+    What this and earlier stages have freed is returned to the system: decoded photos leave pieces in the heap that
+    can take as much memory as the photos that are kept.
+    """
     pixels = sum(
         math.prod(training_size(view.camera.width, view.camera.height, size))
         for view in (*cameras.training, *cameras.held_out)
@@ -84,4 +88,5 @@ def load_photos(cameras: Cameras, size: int, room: Room) -> Photos:
         )
         for views in (cameras.training, cameras.held_out)
     )
+    memory.return_freed()
     return Photos(training, held_out, taken)
