@@ -26,7 +26,7 @@ from splatmill_worker.kernels import ops
 from splatmill_worker.kernels.records import Projected
 from splatmill_worker.splat.evaluate import psnr
 from splatmill_worker.splat.gaussians import Gaussians
-from splatmill_worker.splat.render import camera_tensors
+from splatmill_worker.splat.render import binned
 
 if TYPE_CHECKING:
     from splatmill_worker.splat.views import Target
@@ -128,24 +128,9 @@ def _in_one_photo(
 ) -> _InOnePhoto:
     camera, like = target.camera, gaussians.means
     width, height = camera.width, camera.height
-    viewmat, intrinsics = camera_tensors(camera, like)
     background = background.to(like.device, like.dtype)
     with torch.no_grad():
-        projected = ops.project(
-            gaussians.means,
-            gaussians.log_scales,
-            gaussians.quats,
-            gaussians.logit_opacities,
-            gaussians.sh,
-            viewmat,
-            intrinsics,
-            width,
-            height,
-            degree=gaussians.degree,
-            antialias=antialias,
-            backend=backend,
-        )
-        bins = ops.bin(projected, width, height, backend=backend)
+        projected, bins = binned(gaussians, camera, antialias=antialias, backend=backend)
     opacities = projected.opacities.clamp(max=BELOW_CLAMP).requires_grad_()
     colors = projected.colors.detach().requires_grad_()
     rows: Projected = projected._replace(opacities=opacities, colors=colors)

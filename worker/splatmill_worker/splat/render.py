@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from splatmill_worker.kernels import ops
+from splatmill_worker.kernels.records import Bins, Projected
 from splatmill_worker.scene import Camera
 from splatmill_worker.splat.gaussians import Gaussians
 
@@ -39,6 +40,33 @@ def camera_tensors(camera: Camera, like: Tensor) -> tuple[Tensor, Tensor]:
     return viewmat, intrinsics
 
 
+def binned(
+    gaussians: Gaussians,
+    camera: Camera,
+    *,
+    degree: int | None = None,
+    antialias: bool = False,
+    backend: ops.Backend | None = None,
+) -> tuple[Projected, Bins]:
+    """What `gaussians` project to in the view of `camera`, and their order in each tile; the arguments of `render`."""
+    viewmat, intrinsics = camera_tensors(camera, gaussians.means)
+    projected = ops.project(
+        gaussians.means,
+        gaussians.log_scales,
+        gaussians.quats,
+        gaussians.logit_opacities,
+        gaussians.sh,
+        viewmat,
+        intrinsics,
+        camera.width,
+        camera.height,
+        degree=gaussians.degree if degree is None else min(degree, gaussians.degree),
+        antialias=antialias,
+        backend=backend,
+    )
+    return projected, ops.bin(projected, camera.width, camera.height, backend=backend)
+
+
 def render(
     gaussians: Gaussians,
     camera: Camera,
@@ -55,24 +83,9 @@ def render(
     backend: the kernels that compute it; chosen by the tensors' device where None. An absent backend is an error.
     antialias: compensate opacities for the dilation of 0.3 pixels^2 (Yu et al. 2024, Mip-Splatting).
     """
-    viewmat, intrinsics = camera_tensors(camera, gaussians.means)
     if background is not None:
         background = torch.as_tensor(background).to(gaussians.means.device, gaussians.means.dtype)
-    projected = ops.project(
-        gaussians.means,
-        gaussians.log_scales,
-        gaussians.quats,
-        gaussians.logit_opacities,
-        gaussians.sh,
-        viewmat,
-        intrinsics,
-        camera.width,
-        camera.height,
-        degree=gaussians.degree if degree is None else min(degree, gaussians.degree),
-        antialias=antialias,
-        backend=backend,
-    )
-    bins = ops.bin(projected, camera.width, camera.height, backend=backend)
+    projected, bins = binned(gaussians, camera, degree=degree, antialias=antialias, backend=backend)
     color, alpha, depth = ops.composite(
         projected, bins, camera.width, camera.height, background=background, backend=backend
     )

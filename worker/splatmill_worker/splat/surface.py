@@ -18,7 +18,7 @@ from splatmill_worker.kernels.records import MEDIAN, Projected
 from splatmill_worker.kernels.reference.project import rotation
 from splatmill_worker.scene import Camera
 from splatmill_worker.splat.gaussians import Gaussians
-from splatmill_worker.splat.render import camera_tensors
+from splatmill_worker.splat.render import binned, camera_tensors
 
 THINNEST = 0.01
 """Added to both variances of a projected Gaussian, pixels^2, where its depth follows its plane. A disc that is seen
@@ -63,22 +63,7 @@ def surface(
     transmittance: at which a pixel has its depth, 0.1 to 1.
     """
     width, height = camera.width, camera.height
-    viewmat, intrinsics = camera_tensors(camera, gaussians.means)
-    projected = ops.project(
-        gaussians.means,
-        gaussians.log_scales,
-        gaussians.quats,
-        gaussians.logit_opacities,
-        gaussians.sh,
-        viewmat,
-        intrinsics,
-        width,
-        height,
-        degree=gaussians.degree,
-        antialias=antialias,
-        backend=backend,
-    )
-    bins = ops.bin(projected, width, height, backend=backend)
+    projected, bins = binned(gaussians, camera, antialias=antialias, backend=backend)
     planes = planes_of(gaussians, camera, projected)
     color, _, _ = ops.composite(projected, bins, width, height, backend=backend)
     normals = projected._replace(colors=planes.normals)
