@@ -20,6 +20,7 @@ from splatmill_worker.sfm.features import FeatureStore
 from splatmill_worker.sfm.mapping import mapper
 from splatmill_worker.sfm.matching import pairs
 from splatmill_worker.sfm.run import SfmRun
+from tests.support.motions import FOCAL, ball, model_of
 
 pytestmark = pytest.mark.slow
 
@@ -170,7 +171,7 @@ def _tried(
         (6, 9.0, ["lean", "standard", "high"]),
         (6, 11.0, ["lean"]),
         (4, 11.0, ["lean", "standard", "high"]),  # a model of less than half of the photos is no result yet
-        (9, 11.0, ["lean"]),
+        (10, 11.0, ["lean"]),
     ],
 )
 def test_no_higher_effort_is_tried_where_there_is_no_time_for_it(
@@ -197,3 +198,39 @@ def test_no_higher_effort_is_tried_where_there_is_no_time_for_it(
         == any("no time to try standard" in note for note in run.notes)
         == (spent > 10 and registered == 6)
     )
+
+
+def test_a_higher_effort_begins_with_the_model_of_the_photos_that_it_does_not_retry() -> None:
+    model = model_of(ball, FOCAL)
+    for image_id, image in model.images.items():
+        image.name = features.reduced_name(0, image_id)
+    retried = {image_id for image_id in model.reg_image_ids() if image_id % 3 == 0}
+    mapped = mapper.Mapped("incremental", (model, pycolmap.Reconstruction()), 0)
+    kept = effort._without(mapped, retried)
+    assert kept is not None
+    assert kept.largest is not None
+    assert set(kept.largest.images) == set(model.images) - retried
+    assert kept.registered == 24
+    assert 0 < kept.largest.num_points3D() <= model.num_points3D()
+    for image_id in kept.largest.reg_image_ids():
+        same = model.images[image_id].cam_from_world().matrix()
+        np.testing.assert_allclose(kept.largest.images[image_id].cam_from_world().matrix(), same)
+    assert model.num_reg_images() == 36
+    assert effort._without(None, retried) is None
+
+
+@pytest.mark.parametrize(
+    ("largest", "sides"),
+    [(640, {640}), (1000, {800, 1000}), (4000, {800, 1400})],
+    ids=["small", "middle", "large"],
+)
+def test_photos_that_no_effort_reduces_are_of_one_size_for_all(
+    largest: int, sides: set[int], tmp_path: Path
+) -> None:
+    photos = [SimpleNamespace(width=320, height=240), SimpleNamespace(width=largest // 2, height=largest)]
+    prepared: Any = SimpleNamespace(photos=photos)
+    with ThreadPoolExecutor(1) as pool:
+        run = SfmRun(
+            prepared, [], "SIMPLE_RADIAL", sfm.SfmOptions(), tmp_path, 1, pool, lambda *_: None, lambda: False
+        )
+        assert {run.reduced_side(each) for each in options.EFFORTS.values()} == sides

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+from dataclasses import replace
+
 import numpy as np
 
 from splatmill_worker.colmap import pycolmap
@@ -9,6 +12,7 @@ from splatmill_worker.errors import SfmFailed
 from splatmill_worker.sfm import features
 from splatmill_worker.sfm.features import FeatureStore
 from splatmill_worker.sfm.mapping import mapper
+from splatmill_worker.sfm.mapping.registered import registered
 from splatmill_worker.sfm.matching import pairs, two_view
 from splatmill_worker.sfm.options import LEAN, Effort
 from splatmill_worker.sfm.run import VERSION, EffortResult, SfmRun, digest
@@ -27,11 +31,13 @@ RETRY_ALL = 0.8
 def solve_at(run: SfmRun, effort: Effort, earlier: EffortResult | None) -> EffortResult:
     """Find features, match pairs and map the photos at one effort.
 
-    The features and pairs of photos that `earlier` registered reliably are kept when both efforts use photos of the
-    same size. Raises SfmFailed when the photos have too few features, OSError when COLMAP cannot read the reduced
-    photos, and Cancelled.
+    What `earlier` found of photos that it registered reliably is kept when both efforts use photos of the same size:
+    features and pairs, and their poses and points where these photos are half of all. Raises SfmFailed when the
+    photos have too few features, OSError when COLMAP cannot read the reduced photos, and Cancelled.
     """
-    retried = _retried(run, earlier) if earlier is not None and earlier.effort.side == effort.side else None
+    retried = None
+    if earlier is not None and run.reduced_side(earlier.effort) == run.reduced_side(effort):
+        retried = _retried(run, earlier)
     key = digest(
         VERSION,
         effort,
@@ -69,13 +75,28 @@ def solve_at(run: SfmRun, effort: Effort, earlier: EffortResult | None) -> Effor
         _connect(run, result, database)
         if not result.verified:
             return result
-        result.mapped = best_mapping(run, result.store.database, result.verified)
+        kept = None if earlier is None or retried is None else _without(earlier.mapped, retried)
+        if kept is not None and 2 * kept.registered >= run.count:
+            result.mapped = extended_mapping(run, result.store.database, kept)
+        else:
+            result.mapped = best_mapping(run, result.store.database, result.verified)
         left = _unregistered(run, result)
         if left and _match_unregistered(run, result, left, database):
             result.mapped = _mapped_with_more(run, result, result.mapped)
     finally:
         database.close()
     return result
+
+
+def _without(mapped: mapper.Mapped | None, retried: set[int]) -> mapper.Mapped | None:
+    """The largest of the models without the photos `retried`, which get other features."""
+    if mapped is None or mapped.largest is None:
+        return None
+    model = copy.deepcopy(mapped.largest)
+    for image_id in model.reg_image_ids():
+        if features.photo_index(model.images[image_id].name) in retried:
+            model.deregister_frame(model.images[image_id].frame_id)
+    return replace(mapped, models=(registered(model),))
 
 
 def _mapped_with_more(run: SfmRun, result: EffortResult, mapped: mapper.Mapped) -> mapper.Mapped:

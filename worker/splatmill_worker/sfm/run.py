@@ -23,7 +23,7 @@ from splatmill_worker.sfm.matching.two_view import MIN_INLIERS, TwoView
 from splatmill_worker.sfm.options import Effort, SfmOptions
 from splatmill_worker.sfm.placed import PlacingObserver, placed
 
-VERSION = 6
+VERSION = 7
 """Version of everything that is cached; a cache with another version is not read."""
 
 UNFOLDED = "unfolded.db"
@@ -109,6 +109,10 @@ class SfmRun:
     def count(self) -> int:
         """Number of photos."""
         return len(self.prepared.photos)
+
+    def reduced_side(self, effort: Effort) -> int:
+        """Longest side of the largest photo on which the effort finds features, in pixels: photos are not enlarged."""
+        return min(effort.side, max(max(photo.width, photo.height) for photo in self.prepared.photos))
 
     def on_mapping(self, done: int, total: int, note: str) -> None:
         """Report the progress of a mapper."""

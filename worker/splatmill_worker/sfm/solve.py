@@ -35,9 +35,12 @@ from splatmill_worker.sfm.options import (
 )
 from splatmill_worker.sfm.placed import PlacingObserver
 from splatmill_worker.sfm.run import VERSION, EffortResult, SfmRun, digest, torch_threads
-from splatmill_worker.sfm.trials import ENOUGH_REGISTERED, registered_counts
+from splatmill_worker.sfm.trials import registered_counts
 from splatmill_worker.sfm.unfold import unfold
 from splatmill_worker.sfm.world.frame import require_photos
+
+ENOUGH_PLACED = 0.95
+"""Share of the photos, reliably registered, from which no higher effort is tried (decisions: ENOUGH_PLACED)."""
 
 log = logging.getLogger("splatmill_worker")
 
@@ -181,7 +184,7 @@ def _solve(run: SfmRun) -> EffortResult:
         counts = registered_counts(result.mapped)
         if best is None or counts > best_counts:
             best, best_counts = result, counts
-        if best_counts[0] >= ENOUGH_REGISTERED * run.count:
+        if best_counts[0] >= ENOUGH_PLACED * run.count:
             break
         if effort.name != LEAN.name and not result.verified:
             break  # the standard effort has about three times the lean one's features; even more would not match

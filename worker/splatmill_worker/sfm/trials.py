@@ -10,8 +10,7 @@ from splatmill_worker.sfm.matching import pairs
 from splatmill_worker.sfm.run import SfmRun
 
 ENOUGH_REGISTERED = 0.9
-"""Share of the photos, reliably registered, from which no higher effort is tried; and of those that the view graph
-connects, from which no other mapper is."""
+"""Share of the photos that the view graph connects, reliably registered, from which no other mapper is tried."""
 
 GLOBAL_MIN_PHOTOS = 1000
 """Photos from which the global mapper is tried first, where the view graph is dense (decisions: GLOBAL_MIN_PHOTOS)."""
