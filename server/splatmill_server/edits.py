@@ -10,6 +10,7 @@ from splatmill.backplane.jobs.row import now
 from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import HELD_OUT, Edited, EditModel
+from splatmill_server.jobs.records import read_model_record
 from splatmill_server.space.quota import Arrival
 
 STALE = ("time_lapse", "views", "disagreement", "misfits", "warnings")
@@ -69,11 +70,13 @@ def _store_others(
     report = _edited_report(_read(storage, model_id, "report.json"), model_id, request, edited)
     put("report.json", json.dumps(report, indent=1).encode())
     moment = now().isoformat()
-    record = json.loads(storage.get(layout.job_record(model_id)))
+    job, record = read_model_record(storage, model_id)
     record |= {
         "id": new_id,
         "model": new_id,
-        "name": request.name or record.get("name"),
+        "name": request.name or job.name,
+        "tags": job.tags,
+        "favourite": False,
         "created_at": moment,
         "finished_at": moment,
         "sha256": {},
@@ -92,7 +95,9 @@ def _edited_report(
         "ssim": sum(ssims) / len(ssims) if ssims else None,
     }
     last = (report.get("curve") or [{"seconds": 0.0, "step": 0}])[-1]
-    done = request.model_dump(mode="json", exclude_none=True, exclude={"name", "preview"})
+    done = request.model_dump(mode="json", exclude_none=True, exclude={"name", "preview", "selection"})
+    if request.selection is not None:
+        done["selection"] = len(request.selection.strokes)
     return {
         **{name: value for name, value in report.items() if name not in STALE},
         "seconds": report.get("seconds") or {},

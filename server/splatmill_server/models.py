@@ -6,10 +6,11 @@ They are read from storage, so each stays available while Redis is away; only li
 import json
 import re
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from math import inf
 from typing import Any
 
-from pydantic import ValidationError
+from pydantic import Field, ValidationError
 
 from splatmill.backplane import lists
 from splatmill.backplane.storage import layout
@@ -18,11 +19,13 @@ from splatmill.backplane.storage.storage import Entry, Storage
 from splatmill.schema import (
     DEFAULT_OWNER,
     BinKind,
+    ChangeLabels,
     Job,
     JobState,
     Model,
     ModelCameras,
     ModelFile,
+    ModelOrder,
     ModelPage,
     Report,
     Response,
@@ -31,9 +34,10 @@ from splatmill.schema import (
 from splatmill_server.access.caller import Caller
 from splatmill_server.base.filters import Filter
 from splatmill_server.base.lists import Ended, Lists, each
+from splatmill_server.base.paging import read_cursor, write_cursor
 from splatmill_server.base.problems import ProblemError
 from splatmill_server.base.root_path import address
-from splatmill_server.jobs import names as job_names
+from splatmill_server.jobs import labels as job_labels
 from splatmill_server.jobs.records import Jobs, read_model_record, read_record
 
 _HEADER_BYTES = 8192
@@ -47,10 +51,22 @@ _DEGREE = {0: 0, 9: 1, 24: 2, 45: 3}
 _LISTED_TOGETHER = 500
 
 
-class _Named(Response):
+SORTED = 5000
+"""Largest number of models of a list that is sorted by something else than their time: the records of all are read."""
+
+_RANKS: dict[ModelOrder, Callable[[Model], Any]] = {
+    ModelOrder.name: lambda model: (model.name is None, (model.name or "").casefold()),
+    ModelOrder.size: lambda model: -model.bytes,
+    ModelOrder.psnr: lambda model: inf if model.psnr is None else -model.psnr,
+}
+
+
+class _Labelled(Response):
     """What lists keep of a model before it is first asked for."""
 
     name: str | None
+    tags: list[str] = Field(default_factory=list)
+    favourite: bool = False
 
 
 class Models:
@@ -133,6 +149,8 @@ class Models:
             id=model_id,
             job=model_id,
             name=job.name,
+            tags=job.tags,
+            favourite=job.favourite,
             owner=job.owner,
             created_at=job.finished_at or files["job.json"].modified,
             gaussians=gaussians,
@@ -153,20 +171,51 @@ class Models:
             links=_links(model_id),
         )
 
-    def rename(self, model_id: str, name: str | None) -> Model:
-        """Name a model, and its job with it. Raises 404 and 409 problems."""
+    def label(self, model_id: str, change: ChangeLabels) -> Model:
+        """Change the labels of a model, and of its job with it. Raises 404 and 409 problems."""
         self.check(model_id)
-        self.jobs.rename(model_id, name)
+        self.jobs.label(model_id, change)
         return self.get(model_id)
 
-    def list(self, cursor: str | None, limit: int, only: Filter | None = None) -> ModelPage:
-        """Return a page of the models that `only` admits, the newest first. Raises the problems of `Lists.page`."""
+    def list(
+        self,
+        cursor: str | None,
+        limit: int,
+        only: Filter | None = None,
+        order: ModelOrder = ModelOrder.newest,
+    ) -> ModelPage:
+        """Return a page of the models that `only` admits. Raises the problems of `Lists.page`.
+
+        In an order other than the newest first, raises a 422 problem for a list of more than SORTED models.
+        """
         only = only or Filter()
-        names, narrowed = [lists.name("models", owner=only.owner)], only.name is not None
+        names = [lists.name("models", owner=only.owner)]
+        if order is not ModelOrder.newest:
+            return self._sorted(names, cursor, limit, only, order)
         models, following = self.lists.page(
-            names, cursor, limit, lambda ids: self._listed(ids, only), narrowed=narrowed
+            names, cursor, limit, lambda ids: self._listed(ids, only), narrowed=only.by_labels
         )
         return ModelPage(models=models, cursor=following)
+
+    def _sorted(
+        self, names: Sequence[str], cursor: str | None, limit: int, only: Filter, order: ModelOrder
+    ) -> ModelPage:
+        position, last = read_cursor(cursor) if cursor is not None else (0, "")
+        newest = self.lists.newest(names, None, SORTED + 1)
+        if len(newest) > SORTED:
+            raise ProblemError(
+                "list_too_long",
+                f"The list has more than {SORTED:,} models, which are not sorted by {order}.",
+                advice="List the newest first, or find models by their names and tags.",
+            )
+        ranked = sorted(self._listed([name for _, name in newest], only).values(), key=_RANKS[order])
+        # The page after a model that is no longer listed begins where that was.
+        gone = max(0, position - 1)
+        start = next((place + 1 for place, model in enumerate(ranked) if model.id == last), gone)
+        page, following = ranked[start : start + limit], None
+        if start + limit < len(ranked):
+            following = write_cursor(start + limit, page[-1].id)
+        return ModelPage(models=page, cursor=following)
 
     def _listed(self, model_ids: Sequence[str], only: Filter) -> dict[str, Model]:
         """Return those of these models that `only` admits, by id. What was read of one is kept for lists."""
@@ -175,8 +224,7 @@ class Models:
         asked = [
             name
             for name, record in known.items()
-            if not isinstance(record, Model)
-            and (record is None or only.admits(only.owner or "", record.name))
+            if not isinstance(record, Model) and (record is None or _admits(only, only.owner or "", record))
         ]
         read = dict(zip(asked, each(self._get_or_none, asked), strict=True))
         self.lists.keep(
@@ -186,7 +234,7 @@ class Models:
         return {
             name: record.model_copy(update={"links": _links(name)})
             for name, record in models.items()
-            if only.admits(record.owner or DEFAULT_OWNER, record.name)
+            if _admits(only, record.owner or DEFAULT_OWNER, record)
         }
 
     def _get_or_none(self, model_id: str) -> Model | None:
@@ -222,14 +270,14 @@ class Models:
         lists.clear(connection, "models")
         ids = [name for name in self.storage.children(layout.models()) if layout.is_id(name)]
         unread = any(model_id not in succeeded for model_id in ids)
-        renamed = job_names.renamed(self.storage) if unread else frozenset()
+        labelled = job_labels.labelled(self.storage) if unread else frozenset()
         for start in range(0, len(ids), _LISTED_TOGETHER):
             batch = ids[start : start + _LISTED_TOGETHER]
             ended = {model_id: succeeded[model_id] for model_id in batch if model_id in succeeded}
             others = [model_id for model_id in batch if model_id not in succeeded]
             ended |= {
                 record.id: _ended(record)
-                for record in each(lambda name: self._record(name, renamed), others)
+                for record in each(lambda name: self._record(name, labelled), others)
                 if record is not None
             }
             added = lists.Additions()
@@ -238,17 +286,20 @@ class Models:
             with connection.pipeline() as pipe:
                 added.send(pipe)
                 pipe.execute()
-            names = {model_id: _Named(name=record.name) for model_id, record in ended.items()}
-            self.lists.keep("models", {model_id: _keep(named) for model_id, named in names.items()})
+            kept = {
+                model_id: _Labelled(name=record.name, tags=[*record.tags], favourite=record.favourite)
+                for model_id, record in ended.items()
+            }
+            self.lists.keep("models", {model_id: _keep(record) for model_id, record in kept.items()})
             for model_id in self.lists.deleted(StoredKind.model, list(ended)):
                 if not self.storage.exists(layout.job_record(model_id)):
                     lists.remove_model(connection, model_id, ended[model_id].owner)
             count += len(ended)
         return count
 
-    def _record(self, model_id: str, renamed: frozenset[str] | None = None) -> Job | None:
+    def _record(self, model_id: str, labelled: frozenset[str] | None = None) -> Job | None:
         try:
-            return read_record(self.storage, model_id, renamed).model_copy(update={"id": model_id})
+            return read_record(self.storage, model_id, labelled).model_copy(update={"id": model_id})
         except FileNotFoundError:
             return None
         except UnreadableRecord as error:
@@ -324,7 +375,12 @@ def _digests(record: Mapping[str, Any]) -> dict[str, str]:
 def _ended(record: Job) -> Ended:
     """Return what a list of models shows of the record of one."""
     moment = lists.milliseconds(record.finished_at or record.created_at)
-    return Ended(moment, record.owner or DEFAULT_OWNER, record.name)
+    return Ended(moment, record.owner or DEFAULT_OWNER, record.name, record.tags, record.favourite)
+
+
+def _admits(only: Filter, owner: str, record: Model | _Labelled) -> bool:
+    """Return whether a filter admits a model of this owner."""
+    return only.admits(owner, record.name, record.tags, record.favourite)
 
 
 def _links(model_id: str) -> dict[str, str]:
@@ -344,18 +400,18 @@ def _links(model_id: str) -> dict[str, str]:
     }
 
 
-def _keep(record: Model | _Named) -> bytes:
+def _keep(record: Model | _Labelled) -> bytes:
     """Return what Redis keeps of a model for lists: digests and names of files, in a third of their bytes."""
     return zlib.compress(record.model_dump_json(exclude={"links"}).encode())
 
 
-def _kept(stored: bytes | None) -> Model | _Named | None:
+def _kept(stored: bytes | None) -> Model | _Labelled | None:
     """Return what was kept of a model, or None if nothing was that this version reads."""
     if stored is None:
         return None
     fields = json.loads(zlib.decompress(stored))
     try:
-        return (Model if "files" in fields else _Named).model_validate(fields)
+        return (Model if "files" in fields else _Labelled).model_validate(fields)
     except ValidationError:
         return None
 

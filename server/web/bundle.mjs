@@ -8,8 +8,8 @@ import { build } from "esbuild";
 /** What viewer/splats.js takes from PlayCanvas; a test compares them. */
 export const USED = [
   "AppBase", "AppOptions", "Asset", "CameraComponentSystem", "Color", "createGraphicsDevice", "DEVICETYPE_WEBGL2", "Entity",
-  "GSPLATDATA_LARGE", "GSplatComponentSystem", "GSplatHandler", "Mat4", "Picker", "Quat", "SHADERLANGUAGE_GLSL", "ShaderChunks",
-  "TextureHandler", "TONEMAP_NONE", "version", "WORKBUFFER_UPDATE_ONCE",
+  "GSPLATDATA_LARGE", "GSplatComponentSystem", "GSplatHandler", "Mat4", "Picker", "PIXELFORMAT_R8", "Quat", "SHADERLANGUAGE_GLSL",
+  "ShaderChunks", "Texture", "TextureHandler", "TONEMAP_NONE", "version", "WORKBUFFER_UPDATE_ONCE",
 ];
 
 /** The viewer draws with WebGL 2, so the shaders of WebGPU are left out: each of their modules exports an empty text. */

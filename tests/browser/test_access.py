@@ -5,31 +5,16 @@ The other pages have tests of their own. Axe finds what a program can find, and 
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 from playwright.sync_api import Page, expect
 
 from tests.browser.conftest import Open, SmallModel
-from tests.support.programs import npm_package
+from tests.support.axe import violations
 from tests.support.up import Up
 
 COUNT = """[...document.querySelectorAll("a[href], button, input, select, [tabindex='0']")]
   .filter((element) => element.checkVisibility()).length"""
 """The number of elements that Tab reaches."""
-
-
-def violations(page: Page) -> list[str]:
-    """What axe-core calls serious or critical, with the elements."""
-    page.evaluate((npm_package("axe-core") / "axe.min.js").read_text(encoding="utf-8"))
-    result: dict[str, Any] = page.evaluate("axe.run(document)")
-    assert len(result["passes"]) > 10, "it has looked at the page"
-    found = result["violations"]
-    return [
-        f"{rule['id']}: {[node['target'] for node in rule['nodes']]}"
-        for rule in found
-        if rule["impact"] in ("serious", "critical")
-    ]
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

@@ -121,15 +121,15 @@ def test_a_model_and_its_job_are_renamed(service: Up, model: SmallModel, page: P
     try:
         for path, address in ((f"/models/{model.id}", name), (f"/jobs/{model.id}", "again")):
             page.goto(path)
-            page.get_by_role("button", name="Rename").click()
-            field = page.get_by_role("dialog").get_by_label("Name")
+            page.get_by_role("button", name="Name and tags").click()
+            field = page.get_by_role("dialog").get_by_label("Name", exact=True)
             expect(field).to_be_focused()
             field.fill(address)
             field.press("Enter")
             expect(page.get_by_role("heading", level=1)).to_have_text(address)
-            expect(page.get_by_role("button", name="Rename")).to_be_focused()
+            expect(page.get_by_role("button", name="Name and tags")).to_be_focused()
             assert service.http.get(f"/v1/models/{model.id}").json()["name"] == address
-        page.get_by_role("button", name="Rename").click()
+        page.get_by_role("button", name="Name and tags").click()
         page.get_by_role("dialog").get_by_role("button", name="Keep").click()
         expect(page.get_by_role("heading", level=1)).to_have_text("again")
     finally:

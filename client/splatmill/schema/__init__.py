@@ -172,8 +172,8 @@ if TYPE_CHECKING:
         JobPage,
         LogLine,
         LogPage,
-        Rename,
     )
+    from splatmill.schema.resources.labels import ChangeLabels
     from splatmill.schema.resources.live import (
         SNAPSHOT_MEDIA_TYPE,
         PlacedCamera,
@@ -188,6 +188,7 @@ if TYPE_CHECKING:
         ModelCamera,
         ModelCameras,
         ModelFile,
+        ModelOrder,
         ModelPage,
         Report,
         StageSeconds,
@@ -208,6 +209,7 @@ if TYPE_CHECKING:
         Presentation,
         Scale,
     )
+    from splatmill.schema.resources.selections import Selection, Stroke
     from splatmill.schema.resources.shares import (
         LONGEST_SHARE,
         CreateShare,
@@ -299,6 +301,7 @@ __all__ = [
     "Capture",
     "CaptureFile",
     "CapturePage",
+    "ChangeLabels",
     "ChangePresentation",
     "Color",
     "ComparedWith",
@@ -367,6 +370,7 @@ __all__ = [
     "ModelFile",
     "ModelFormat",
     "ModelFrame",
+    "ModelOrder",
     "ModelPage",
     "NewKeyLimits",
     "OptionHelp",
@@ -392,7 +396,6 @@ __all__ = [
     "ProgressEvent",
     "QueueInfo",
     "Ready",
-    "Rename",
     "RenderRequest",
     "Report",
     "Request",
@@ -401,6 +404,7 @@ __all__ = [
     "RotateKey",
     "Scale",
     "Scope",
+    "Selection",
     "Share",
     "ShareList",
     "ShareWithToken",
@@ -414,6 +418,7 @@ __all__ = [
     "StoredBytes",
     "StoredKind",
     "StoredRecord",
+    "Stroke",
     "Switch",
     "Time",
     "Trace",

@@ -41,6 +41,7 @@ PROBLEMS: dict[str, Kind] = {
     "size_out_of_range": Kind(422, "The image size is outside its range"),
     "name_invalid": Kind(422, "The file name is not accepted"),
     "url_refused": Kind(422, "The server sends no requests to this address"),
+    "list_too_long": Kind(422, "The list is too long to be sorted"),
     "cursor_invalid": Kind(422, "The page cursor is not valid"),
     "upload_length_differs": Kind(400, "The upload has another length than was announced"),
     "idempotency_conflict": Kind(409, "This Idempotency-Key was used for another request"),

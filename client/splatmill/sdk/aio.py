@@ -18,6 +18,7 @@ from splatmill.schema import (
     JobPage,
     Me,
     Model,
+    ModelOrder,
     ModelPage,
     OptionHelp,
     OptionList,
@@ -226,17 +227,27 @@ class AsyncClient:
         limit: int | None = None,
         state: str | Iterable[str] | None = None,
         name: str | None = None,
+        tag: str | None = None,
+        favourite: bool | None = None,
         capture: str | None = None,
         owner: str | None = None,
     ) -> AsyncIterator[Job]:
         """Yield the jobs, newest first, at most `limit` of them.
 
-        `state` chooses those in this state, or one of several. `name` chooses those whose name contains this text, in
-        any case of letters, `capture` those on the capture with this id, and `owner` those of one owner, for callers
-        with the scope admin. Pages are requested as needed.
+        `state` chooses those in this state, or one of several. `name` chooses those whose name contains this text, and
+        `tag` those with this tag, in any case of letters; `favourite` those with a star, or without one; `capture`
+        those on the capture with this id, and `owner` those of one owner, for callers with the scope admin. Pages are
+        requested as needed.
         """
         states = [state] if isinstance(state, str) else list(state or ())
-        filters = {"state": states or None, "name": name, "capture": capture, "owner": owner}
+        filters = {
+            "state": states or None,
+            "name": name,
+            "tag": tag,
+            "favourite": favourite,
+            "capture": capture,
+            "owner": owner,
+        }
         return self._entries(JobPage, "/v1/jobs", lambda page: page.jobs, limit, filters)
 
     async def model(self, model_id: str) -> AsyncModelHandle:
@@ -244,16 +255,23 @@ class AsyncClient:
         return await find_model(self.connection, model_id)
 
     def models(
-        self, *, limit: int | None = None, name: str | None = None, owner: str | None = None
+        self,
+        *,
+        limit: int | None = None,
+        name: str | None = None,
+        tag: str | None = None,
+        favourite: bool | None = None,
+        sort: ModelOrder | str = ModelOrder.newest,
+        owner: str | None = None,
     ) -> AsyncIterator[Model]:
-        """Yield the finished models, newest first, at most `limit` of them.
+        """Yield the finished models, at most `limit` of them.
 
-        `name` chooses those whose name contains this text, in any case of letters. `owner` chooses those of one
-        owner, for callers with the scope admin. Pages are requested as needed.
+        `name` chooses those whose name contains this text, and `tag` those with this tag, in any case of letters;
+        `favourite` those with a star, or without one. `sort` is what comes first: newest, name, size or psnr. `owner`
+        chooses those of one owner, for callers with the scope admin. Pages are requested as needed.
         """
-        return self._entries(
-            ModelPage, "/v1/models", lambda page: page.models, limit, {"name": name, "owner": owner}
-        )
+        filters = {"name": name, "tag": tag, "favourite": favourite, "sort": str(sort), "owner": owner}
+        return self._entries(ModelPage, "/v1/models", lambda page: page.models, limit, filters)
 
     async def options(self) -> list[OptionHelp]:
         """Return the training options of the server, with type, default, range and help."""

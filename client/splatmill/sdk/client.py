@@ -25,12 +25,14 @@ from splatmill.schema import (
     Model,
     ModelCamera,
     ModelDownload,
+    ModelOrder,
     OptionHelp,
     Placement,
     Presentation,
     Problem,
     Ready,
     Report,
+    Selection,
     StorageUse,
     TrainOptions,
 )
@@ -88,6 +90,13 @@ class ModelHandle:
     def rename(self, name: str | None) -> Model:
         """Name the model, and its job with it; None takes the name away. Returns the record."""
         return self._loop.run(self._async.rename(name))
+
+    def label(self, *, tags: Sequence[str] | None = None, favourite: bool | None = None) -> Model:
+        """Give the model, and its job with it, these tags in place of those it has, or a star. Returns the record.
+
+        None leaves them as they are. Raises InvalidRequest for more than 12 tags, or ones over 40 characters.
+        """
+        return self._loop.run(self._async.label(tags=tags, favourite=favourite))
 
     def delete(self) -> None:
         """Delete the model with its job, its report and its files. The capture is kept."""
@@ -151,6 +160,7 @@ class ModelHandle:
         box: Box | Mapping[str, Sequence[float]] | None = None,
         min_opacity: float | None = None,
         max_size: float | None = None,
+        selection: Selection | Mapping[str, Any] | None = None,
         name: str | None = None,
         preview: bool = False,
     ) -> Edited:
@@ -159,15 +169,23 @@ class ModelHandle:
         box: keep the Gaussians whose centre lies in it: `{"min": [x, y, z], "max": [x, y, z]}` in units of the model.
         min_opacity: keep the Gaussians of at least this opacity, between 0 and 1.
         max_size: keep the Gaussians whose standard deviation is at most this along every axis, in units of the model.
+        selection: leave out the Gaussians in it, which was drawn on views of the model.
         name: of the new model; left out, that of this one.
         preview: only measure; no model is made.
 
-        At least one of box, min_opacity and max_size is needed. `model` of the returned record is the id of the new
-        model, None for a preview. Raises InvalidRequest for values that are not valid, and for an edit that leaves
-        nothing.
+        At least one of box, min_opacity, max_size and selection is needed. `model` of the returned record is the id of
+        the new model, None for a preview. Raises InvalidRequest for values that are not valid, and for an edit that
+        leaves nothing.
         """
         return self._loop.run(
-            self._async.edit(box=box, min_opacity=min_opacity, max_size=max_size, name=name, preview=preview)
+            self._async.edit(
+                box=box,
+                min_opacity=min_opacity,
+                max_size=max_size,
+                selection=selection,
+                name=name,
+                preview=preview,
+            )
         )
 
 
@@ -210,6 +228,13 @@ class JobHandle:
     def rename(self, name: str | None) -> Job:
         """Name the job, and its model with it; None takes the name away. Returns the record."""
         return self._loop.run(self._async.rename(name))
+
+    def label(self, *, tags: Sequence[str] | None = None, favourite: bool | None = None) -> Job:
+        """Give the job, and its model with it, these tags in place of those it has, or a star. Returns the record.
+
+        None leaves them as they are. Raises InvalidRequest for more than 12 tags, or ones over 40 characters.
+        """
+        return self._loop.run(self._async.label(tags=tags, favourite=favourite))
 
     def events(self, after: str | None = None) -> Iterator[EventRecord]:
         """Yield the events of the job until it ends. A lost connection is restored without losing events.
@@ -437,17 +462,28 @@ class Client:
         limit: int | None = None,
         state: str | Iterable[str] | None = None,
         name: str | None = None,
+        tag: str | None = None,
+        favourite: bool | None = None,
         capture: str | None = None,
         owner: str | None = None,
     ) -> Iterator[Job]:
         """Yield the jobs, newest first, at most `limit` of them.
 
-        `state` chooses those in this state, or one of several. `name` chooses those whose name contains this text, in
-        any case of letters, `capture` those on the capture with this id, and `owner` those of one owner, for callers
-        with the scope admin. Pages are requested as needed.
+        `state` chooses those in this state, or one of several. `name` chooses those whose name contains this text, and
+        `tag` those with this tag, in any case of letters; `favourite` those with a star, or without one; `capture`
+        those on the capture with this id, and `owner` those of one owner, for callers with the scope admin. Pages are
+        requested as needed.
         """
         return self._loop.iterate(
-            self._async.jobs(limit=limit, state=state, name=name, capture=capture, owner=owner)
+            self._async.jobs(
+                limit=limit,
+                state=state,
+                name=name,
+                tag=tag,
+                favourite=favourite,
+                capture=capture,
+                owner=owner,
+            )
         )
 
     def model(self, model_id: str) -> ModelHandle:
@@ -455,14 +491,24 @@ class Client:
         return ModelHandle(self._loop, self._loop.run(self._async.model(model_id)))
 
     def models(
-        self, *, limit: int | None = None, name: str | None = None, owner: str | None = None
+        self,
+        *,
+        limit: int | None = None,
+        name: str | None = None,
+        tag: str | None = None,
+        favourite: bool | None = None,
+        sort: ModelOrder | str = ModelOrder.newest,
+        owner: str | None = None,
     ) -> Iterator[Model]:
-        """Yield the finished models, newest first, at most `limit` of them.
+        """Yield the finished models, at most `limit` of them.
 
-        `name` chooses those whose name contains this text, in any case of letters. `owner` chooses those of one
-        owner, for callers with the scope admin. Pages are requested as needed.
+        `name` chooses those whose name contains this text, and `tag` those with this tag, in any case of letters;
+        `favourite` those with a star, or without one. `sort` is what comes first: newest, name, size or psnr. `owner`
+        chooses those of one owner, for callers with the scope admin. Pages are requested as needed.
         """
-        return self._loop.iterate(self._async.models(limit=limit, name=name, owner=owner))
+        return self._loop.iterate(
+            self._async.models(limit=limit, name=name, tag=tag, favourite=favourite, sort=sort, owner=owner)
+        )
 
     def options(self) -> list[OptionHelp]:
         """Return the training options of the server, with type, default, range and help."""

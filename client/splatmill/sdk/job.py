@@ -2,8 +2,9 @@
 
 import asyncio
 import time
-from collections.abc import AsyncGenerator, AsyncIterator
+from collections.abc import AsyncGenerator, AsyncIterator, Mapping, Sequence
 from contextlib import aclosing
+from typing import Any
 
 from splatmill.errors import Conflict, ConnectionFailed, JobCancelled, JobFailed, Unavailable, WaitTimeout
 from splatmill.schema import (
@@ -22,7 +23,7 @@ from splatmill.schema import (
     StateEvent,
     Watch,
 )
-from splatmill.sdk.model import AsyncModelHandle, find_model
+from splatmill.sdk.model import AsyncModelHandle, find_model, label_changes
 from splatmill.transfer.connection import Connection, backoff, read_answer
 from splatmill.transfer.sse import GIVE_UP_SECONDS, follow_events
 from splatmill.transfer.uploads import OnProgress
@@ -61,9 +62,17 @@ class AsyncJobHandle:
 
     async def rename(self, name: str | None) -> Job:
         """Name the job, and its model with it; None takes the name away. Returns the record."""
-        response = await self.connection.request(
-            "PATCH", f"/v1/jobs/{self.id}", json={"name": name}, repeatable=True
-        )
+        return await self._change({"name": name})
+
+    async def label(self, *, tags: Sequence[str] | None = None, favourite: bool | None = None) -> Job:
+        """Give the job, and its model with it, these tags in place of those it has, or a star. Returns the record.
+
+        None leaves them as they are. Raises InvalidRequest for more than 12 tags, or ones over 40 characters.
+        """
+        return await self._change(label_changes(tags, favourite))
+
+    async def _change(self, labels: Mapping[str, Any]) -> Job:
+        response = await self.connection.request("PATCH", f"/v1/jobs/{self.id}", json=labels, repeatable=True)
         self.job = read_answer(Job, response)
         return self.job
 

@@ -14,6 +14,7 @@ from splatmill.files import atomic_write
 from splatmill.schema import (
     Box,
     CameraSpec,
+    ChangeLabels,
     ChangePresentation,
     Edited,
     EditModel,
@@ -25,6 +26,7 @@ from splatmill.schema import (
     OrbitRequest,
     Presentation,
     RenderRequest,
+    Selection,
 )
 from splatmill.sdk.arguments import OrbitArguments, PresentationArguments, RenderArguments
 from splatmill.sdk.orbits import AsyncOrbits, orbit_request
@@ -37,6 +39,15 @@ from splatmill.transfer.uploads import OnProgress
 RENDER_TIMEOUT = httpx.Timeout(30.0, read=150.0)
 # Without a GPU, hundreds of frames take minutes, and the response begins when the video is complete.
 ORBIT_TIMEOUT = httpx.Timeout(30.0, read=900.0)
+
+
+def label_changes(tags: Sequence[str] | None, favourite: bool | None) -> dict[str, Any]:
+    """Return the request that changes the tags and the star; None leaves one as it is. Raises InvalidRequest."""
+    changes = {name: value for name, value in (("tags", tags), ("favourite", favourite)) if value is not None}
+    try:
+        return ChangeLabels.model_validate(changes).model_dump(mode="json", exclude_unset=True)
+    except ValidationError as error:
+        raise invalid_request(error) from error
 
 
 class AsyncModelHandle:
@@ -94,8 +105,18 @@ class AsyncModelHandle:
 
     async def rename(self, name: str | None) -> Model:
         """Name the model, and its job with it; None takes the name away. Returns the record."""
+        return await self._change({"name": name})
+
+    async def label(self, *, tags: Sequence[str] | None = None, favourite: bool | None = None) -> Model:
+        """Give the model, and its job with it, these tags in place of those it has, or a star. Returns the record.
+
+        None leaves them as they are. Raises InvalidRequest for more than 12 tags, or ones over 40 characters.
+        """
+        return await self._change(label_changes(tags, favourite))
+
+    async def _change(self, labels: Mapping[str, Any]) -> Model:
         response = await self.connection.request(
-            "PATCH", f"/v1/models/{self.id}", json={"name": name}, repeatable=True
+            "PATCH", f"/v1/models/{self.id}", json=labels, repeatable=True
         )
         self.model = read_answer(Model, response)
         return self.model
@@ -210,6 +231,7 @@ class AsyncModelHandle:
         box: Box | Mapping[str, Sequence[float]] | None = None,
         min_opacity: float | None = None,
         max_size: float | None = None,
+        selection: Selection | Mapping[str, Any] | None = None,
         name: str | None = None,
         preview: bool = False,
     ) -> Edited:
@@ -218,17 +240,19 @@ class AsyncModelHandle:
         box: keep the Gaussians whose centre lies in it: `{"min": [x, y, z], "max": [x, y, z]}` in units of the model.
         min_opacity: keep the Gaussians of at least this opacity, between 0 and 1.
         max_size: keep the Gaussians whose standard deviation is at most this along every axis, in units of the model.
+        selection: leave out the Gaussians in it, which was drawn on views of the model.
         name: of the new model; left out, that of this one.
         preview: only measure; no model is made.
 
-        At least one of box, min_opacity and max_size is needed. `model` of the returned record is the id of the new
-        model, None for a preview. Raises InvalidRequest for values that are not valid, and for an edit that leaves
-        nothing.
+        At least one of box, min_opacity, max_size and selection is needed. `model` of the returned record is the id of
+        the new model, None for a preview. Raises InvalidRequest for values that are not valid, and for an edit that
+        leaves nothing.
         """
         values = {
             "box": box,
             "min_opacity": min_opacity,
             "max_size": max_size,
+            "selection": selection,
             "name": name,
             "preview": preview,
         }

@@ -57,6 +57,8 @@ class Ended:
     moment: int
     owner: str
     name: str | None
+    tags: Sequence[str] = ()
+    favourite: bool = False
 
 
 class Lists:

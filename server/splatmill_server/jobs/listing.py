@@ -62,11 +62,11 @@ def page(
         return {
             job_id: held_job
             for job_id, held_job in held.items()
-            if only.admits(held_job.row.owner, held_job.row.name)
+            if only.admits(held_job.row.owner, held_job.row.name, held_job.row.tags, held_job.row.favourite)
             and (only.states is None or held_job.state in only.states)
         }
 
-    narrowed = only.name is not None or only.states is not None
+    narrowed = only.by_labels or only.states is not None
     held_jobs, following = listed.page(
         _lists(only), cursor, limit, read, narrowed=narrowed, likely=likely if narrowed else None
     )

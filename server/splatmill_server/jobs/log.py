@@ -18,7 +18,7 @@ from splatmill.backplane.storage.records import FORMAT, check_format, reason, wa
 from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import Job, LogEvent, LogLine
 from splatmill.schema.tolerant import keep_readable
-from splatmill_server.jobs import names
+from splatmill_server.jobs import labels
 from splatmill_server.jobs.reading import is_deleted
 
 
@@ -64,16 +64,15 @@ class StoredEnd:
     generation: int
 
 
-def get_stored_end(storage: Storage, job_id: str, renamed: frozenset[str] | None = None) -> StoredEnd | None:
-    """Return a job as it ended, from the file of its log, under its present name, or None.
+def get_stored_end(storage: Storage, job_id: str, labelled: frozenset[str] | None = None) -> StoredEnd | None:
+    """Return a job as it ended, from the file of its log, under its present labels, or None.
 
-    renamed: the jobs that were renamed, where they are known.
+    labelled: the jobs that were given labels, where they are known.
     """
     end = _stored(storage, job_id)[0]
     if end is None or not end.job.state.final:
         return None
-    name = names.get(storage, job_id, end.job.name, renamed)
-    return StoredEnd(end.job.model_copy(update={"name": name}), end.generation)
+    return StoredEnd(labels.under(storage, job_id, end.job, labelled), end.generation)
 
 
 def text(lines: Iterable[LogLine]) -> str:

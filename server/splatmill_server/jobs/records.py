@@ -1,4 +1,5 @@
-"""The records of jobs: makes, restarts, cancels, ends and deletes them. No other code writes job rows.
+"""The records of jobs: makes, restarts, cancels, ends and deletes them. No other code writes job rows, but for
+what `labels` writes.
 
 Each change is one optimistic transaction on the row, and on the states stream if the change depends on it, so that
 API processes and workers never overwrite each other's changes.
@@ -21,15 +22,16 @@ from splatmill.backplane.queue import queue
 from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.records import UnreadableRecord, check_format, reason, warn
 from splatmill.backplane.storage.storage import Storage, StorageError
-from splatmill.schema import DEFAULT_OWNER, CreateJob, Job, JobPage, JobState, Problem
+from splatmill.schema import DEFAULT_OWNER, ChangeLabels, CreateJob, Job, JobPage, JobState, Problem
 from splatmill.schema.tolerant import keep_readable
 from splatmill_server.access.caller import Caller
 from splatmill_server.base.filters import JobFilter
+from splatmill_server.base.leases import exclusive
 from splatmill_server.base.lists import Ended, Lists
 from splatmill_server.base.metrics import Metrics
 from splatmill_server.base.problems import ProblemError
 from splatmill_server.jobs import curve as job_curve
-from splatmill_server.jobs import listing, names, outcome, requests, restoring, shrinking
+from splatmill_server.jobs import labels, listing, outcome, requests, restoring, shrinking
 from splatmill_server.jobs import log as job_log
 from splatmill_server.jobs.links import with_links
 from splatmill_server.jobs.queue_places import QueuePlaces
@@ -329,27 +331,22 @@ class Jobs:
         job_row = self.get_row(job_id)
         return self._placed(job_row) if _waits(job_row, self._job(job_row)) else None
 
-    def rename(self, job_id: str, name: str | None) -> Job:
-        """Name a job, and its model with it. Raises a 404 problem if there is no such job."""
+    def label(self, job_id: str, change: ChangeLabels) -> Job:
+        """Change the labels of a job, and of its model with it. Raises a 404 problem if there is no such job."""
         self.get(job_id)
-        names.save(
-            self.storage, job_id, name
-        )  # first: a job that Redis loses from here on is restored with it
-
-        def set_name(pipe: Any) -> None:
-            known = pipe.exists(keys.job(job_id))
-            pipe.multi()
-            if known and name is not None:
-                pipe.hset(keys.job(job_id), "name", name)
-            elif known:
-                pipe.hdel(keys.job(job_id), "name")
-            pipe.hdel(keys.records("models"), job_id)
-
-        self.connection.transaction(set_name, keys.job(job_id))
+        with exclusive(self.connection, "labels", job_id):
+            job = self.get(job_id)
+            known = labels.get(self.storage, job_id)
+            known = known or labels.Labels(name=job.name, tags=job.tags, favourite=job.favourite)
+            after = known.model_copy(update=change.model_dump(exclude_unset=True))
+            labels.save(
+                self.storage, job_id, after
+            )  # first: a job that Redis loses from here on is restored with it
+            labels.write(self.connection, job_id, after)
         try:
             return self.get(job_id)
         except ProblemError:
-            names.delete(self.storage, job_id)  # the job was deleted meanwhile
+            labels.delete(self.storage, job_id)  # the job was deleted meanwhile
             raise
 
     def restart(self, job_id: str, *, check: Callable[[], None], watched: Sequence[str]) -> Job:
@@ -412,7 +409,7 @@ class Jobs:
         self.storage.delete(layout.job_record(job_id))
         self.storage.delete_prefix(layout.model(job_id))
         self.storage.delete_prefix(layout.job(job_id))
-        names.delete(self.storage, job_id)
+        labels.delete(self.storage, job_id)
         with self.connection.pipeline(transaction=True) as pipe:
             pipe.delete(*keys.of_job(job_id))
             lists.remove_job(pipe, job_id, owner, capture)
@@ -540,18 +537,18 @@ def _waits(job_row: JobRow, job: Job) -> bool:
     return False
 
 
-def read_record(storage: Storage, job_id: str, renamed: frozenset[str] | None = None) -> Job:
-    """Return the job in the `job.json` of a model, without what is not readable in it, under its present name.
+def read_record(storage: Storage, job_id: str, labelled: frozenset[str] | None = None) -> Job:
+    """Return the job in the `job.json` of a model, without what is not readable in it, under its labels.
 
-    renamed: the jobs that were renamed, where they are known.
+    labelled: the jobs that were given labels, where they are known.
 
     Raises FileNotFoundError, and UnreadableRecord.
     """
-    return read_model_record(storage, job_id, renamed)[0]
+    return read_model_record(storage, job_id, labelled)[0]
 
 
 def read_model_record(
-    storage: Storage, job_id: str, renamed: frozenset[str] | None = None
+    storage: Storage, job_id: str, labelled: frozenset[str] | None = None
 ) -> tuple[Job, dict[str, Any]]:
     """Return the job in the `job.json` of a model, as `read_record` does, and all fields of that file."""
     try:
@@ -562,7 +559,7 @@ def read_model_record(
         raise UnreadableRecord(f"job.json cannot be read: {reason(error)}") from error
     if left_out:
         warn(layout.job_record(job_id), f"left out what cannot be read: {'; '.join(left_out)[:300]}")
-    return job.model_copy(update={"name": names.get(storage, job_id, job.name, renamed)}), record
+    return labels.under(storage, job_id, job, labelled), record
 
 
 def last_stage(job: Job) -> str | None:

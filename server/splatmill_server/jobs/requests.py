@@ -14,7 +14,7 @@ from splatmill.backplane.jobs.row import JobRow
 from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.records import UnreadableRecord, reason, warn
 from splatmill.backplane.storage.storage import Storage
-from splatmill_server.jobs import names
+from splatmill_server.jobs import labels
 
 
 def save(storage: Storage, begun: JobRow) -> None:
@@ -28,8 +28,8 @@ def next_generation(job_row: JobRow, moment: datetime, request: str | None) -> J
     return job_row.model_copy(update=changes | {"cancel_requested_at": None, "verdict": None})
 
 
-def get(storage: Storage, job_id: str, renamed: frozenset[str] | None = None) -> JobRow | None:
-    """Return the row of an unfinished job, under its present name, or None if there is none that can be read."""
+def get(storage: Storage, job_id: str, labelled: frozenset[str] | None = None) -> JobRow | None:
+    """Return the row of an unfinished job, under its present labels, or None if there is none to read."""
     path = layout.unfinished_job(job_id)
     try:
         begun = JobRow.model_validate_json(storage.get(path))
@@ -38,7 +38,7 @@ def get(storage: Storage, job_id: str, renamed: frozenset[str] | None = None) ->
     except ValueError as error:
         warn(path, reason(error))
         return None
-    return begun.model_copy(update={"name": names.get(storage, job_id, begun.name, renamed)})
+    return labels.under(storage, job_id, begun, labelled)
 
 
 def list_ids(storage: Storage) -> list[str]:

@@ -19,8 +19,9 @@ from splatmill.backplane.storage.records import FORMAT
 from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import Event, Job, JobState, PlanEvent, ProgressEvent, StateEvent, StoredKind
 from splatmill_server.base.lists import Ended, Lists, each
+from splatmill_server.jobs import labels as job_labels
 from splatmill_server.jobs import log as job_log
-from splatmill_server.jobs import names, requests, shrinking
+from splatmill_server.jobs import requests, shrinking
 from splatmill_server.jobs.reading import read_jobs
 
 log = structlog.get_logger()
@@ -46,10 +47,10 @@ def make_lists(connection: redis.Redis, storage: Storage, listed: Lists, succeed
     unfinished = requests.list_ids(storage)
     for start in range(0, len(unfinished), _BATCH):
         count += restore_unfinished(connection, storage, unfinished[start : start + _BATCH])
-    ended, renamed = storage.children(layout.jobs()), names.renamed(storage)
+    ended, labelled = storage.children(layout.jobs()), job_labels.labelled(storage)
     for start in range(0, len(ended), _BATCH):
         batch = ended[start : start + _BATCH]
-        count += _restore_ended(connection, storage, listed, batch, succeeded, renamed)
+        count += _restore_ended(connection, storage, listed, batch, succeeded, labelled)
     return count
 
 
@@ -68,10 +69,10 @@ def restore_unfinished(connection: redis.Redis, storage: Storage, job_ids: Seque
     They are not put into the queue at once, because a worker that still runs one takes its lease again (see GRACE).
     """
     missing = without_row(connection, job_ids)
-    renamed = names.renamed(storage) if missing else frozenset()
+    labelled = job_labels.labelled(storage) if missing else frozenset()
     rows = [
         job_row
-        for job_row in each(lambda job_id: _unfinished(storage, job_id, renamed), missing)
+        for job_row in each(lambda job_id: _unfinished(storage, job_id, labelled), missing)
         if job_row is not None
     ]
     if not rows:
@@ -95,10 +96,10 @@ def _put_row(pipe: Any, job_row: JobRow) -> None:
     pipe.eval(_PUT_ROW, 1, keys.job(job_row.id), *fields)
 
 
-def _unfinished(storage: Storage, job_id: str, renamed: frozenset[str]) -> JobRow | None:
+def _unfinished(storage: Storage, job_id: str, labelled: frozenset[str]) -> JobRow | None:
     """Return the row of an unfinished job, or None if its generation has ended and only the request was left."""
-    request = requests.get(storage, job_id, renamed)
-    ended = job_log.get_stored_end(storage, job_id, renamed) if request is not None else None
+    request = requests.get(storage, job_id, labelled)
+    ended = job_log.get_stored_end(storage, job_id, labelled) if request is not None else None
     if request is not None and ended is not None and ended.generation >= request.generation:
         storage.delete(layout.unfinished_job(job_id))
         return None
@@ -131,13 +132,13 @@ def _restore_ended(
     listed: Lists,
     job_ids: Sequence[str],
     succeeded: dict[str, Ended],
-    renamed: frozenset[str],
+    labelled: frozenset[str],
 ) -> int:
     """Restore those of the jobs that have ended and have no row, and return their number."""
     missing = [job_id for job_id in without_row(connection, job_ids) if layout.is_id(job_id)]
     ends = [
         end
-        for end in each(lambda job_id: job_log.get_stored_end(storage, job_id, renamed), missing)
+        for end in each(lambda job_id: job_log.get_stored_end(storage, job_id, labelled), missing)
         if end is not None
     ]
     with connection.pipeline() as pipe:
@@ -161,7 +162,9 @@ def _note(succeeded: dict[str, Ended], job: Job) -> None:
     """Note a job if it has succeeded. It ended just after its model was stored."""
     if job.state is JobState.succeeded:
         moment = lists.milliseconds(job.finished_at or job.created_at)
-        succeeded[job.id] = Ended(moment, job.owner or JobRow.model_fields["owner"].default, job.name)
+        succeeded[job.id] = Ended(
+            moment, job.owner or JobRow.model_fields["owner"].default, job.name, job.tags, job.favourite
+        )
 
 
 def _restore(pipe: Any, added: lists.Additions, job: Job, generation: int) -> None:
@@ -194,6 +197,8 @@ def _restore(pipe: Any, added: lists.Additions, job: Job, generation: int) -> No
         id=job.id,
         capture=job.capture,
         name=job.name,
+        tags=job.tags,
+        favourite=job.favourite,
         owner=job.owner or JobRow.model_fields["owner"].default,
         options=job.options,
         priority=job.priority,

@@ -19,6 +19,14 @@ NamePart = Annotated[
     ),
 ]
 
+TagOf = Annotated[
+    str | None,
+    Query(max_length=40, description="List only records with this tag, in any case of letters."),
+]
+Favourite = Annotated[
+    bool | None, Query(description="List only records with a star, or, if false, only those without one.")
+]
+
 
 async def _json_only(request: Request) -> None:  # as a coroutine, it takes no thread of the pool
     media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()

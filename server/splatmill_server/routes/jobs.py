@@ -8,13 +8,13 @@ from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import JSONResponse, Response
 
-from splatmill.schema import IDEMPOTENCY_HEADER, CreateJob, Job, JobPage, JobState, Rename
+from splatmill.schema import IDEMPOTENCY_HEADER, ChangeLabels, CreateJob, Job, JobPage, JobState
 from splatmill_server.access.caller import Caller, Who
 from splatmill_server.base.filters import JobFilter
 from splatmill_server.base.paging import DEFAULT_LIMIT
 from splatmill_server.base.problems import ProblemError
 from splatmill_server.requests.ownership import JobId, ListedOwner
-from splatmill_server.requests.parameters import JSON_ONLY, Cursor, Limit, NamePart
+from splatmill_server.requests.parameters import JSON_ONLY, Cursor, Favourite, Limit, NamePart, TagOf
 from splatmill_server.routes.job_form import create_from_form
 from splatmill_server.routes.openapi import JOB_REQUESTS, answer, problems
 from splatmill_server.service import Service, Shared
@@ -130,13 +130,15 @@ def list_jobs(
         Query(description="List only jobs in this state; repeat it for several states."),
     ] = None,
     name: NamePart = None,
+    tag: TagOf = None,
+    favourite: Favourite = None,
     capture: Annotated[
         str | None, Query(max_length=64, description="List only jobs on the capture with this id.")
     ] = None,
 ) -> JobPage:
     """List jobs, newest first. A page of a filtered list may hold fewer than `limit` although it has a `cursor`."""
     states = frozenset(state) if state else None
-    return service.jobs.list(cursor, limit, JobFilter(owner, name, capture, states))
+    return service.jobs.list(cursor, limit, JobFilter(owner, name, tag, favourite, capture, states))
 
 
 @router.get("/{job_id}", responses=problems("job_not_found"))
@@ -152,9 +154,9 @@ def get_job(service: Shared, job_id: JobId) -> Job:
     ),
     dependencies=[JSON_ONLY],
 )
-def rename_job(service: Shared, job_id: JobId, change: Rename) -> Job:
-    """Name a job, and its model with it."""
-    return service.jobs.rename(job_id, change.name)
+def label_job(service: Shared, job_id: JobId, change: ChangeLabels) -> Job:
+    """Change the name, the tags and the star of a job, and of its model with it."""
+    return service.jobs.label(job_id, change)
 
 
 @router.delete(

@@ -2,7 +2,7 @@
 
 from typing import Annotated
 
-from fastapi import APIRouter, Body, Path, Request
+from fastapi import APIRouter, Body, Path, Query, Request
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
@@ -11,12 +11,13 @@ from splatmill.backplane.storage import layout
 from splatmill.schema import (
     DOWNLOADS,
     POSTER,
+    ChangeLabels,
     Model,
     ModelCameras,
     ModelDownloads,
+    ModelOrder,
     ModelPage,
     OrbitRequest,
-    Rename,
     RenderRequest,
     Scope,
 )
@@ -25,7 +26,7 @@ from splatmill_server.access.permission import needs
 from splatmill_server.base.filters import Filter
 from splatmill_server.base.paging import DEFAULT_LIMIT
 from splatmill_server.requests.ownership import ListedOwner, ModelId
-from splatmill_server.requests.parameters import JSON_ONLY, Cursor, Limit, NamePart
+from splatmill_server.requests.parameters import JSON_ONLY, Cursor, Favourite, Limit, NamePart, TagOf
 from splatmill_server.responses.files import attachment
 from splatmill_server.responses.forward import CLIENT_GONE, forward, while_connected
 from splatmill_server.responses.model_outputs import file_name, model_file, model_in_format, rendered_by_query
@@ -76,16 +77,19 @@ CAMERA_QUERY = [
 ]
 
 
-@router.get("", responses=problems("cursor_invalid", "lists_not_ready"))
+@router.get("", responses=problems("cursor_invalid", "lists_not_ready", "list_too_long"))
 def list_models(
     service: Shared,
     owner: ListedOwner,
     cursor: Cursor = None,
     limit: Limit = DEFAULT_LIMIT,
     name: NamePart = None,
+    tag: TagOf = None,
+    favourite: Favourite = None,
+    sort: Annotated[ModelOrder, Query(description="What comes first.")] = ModelOrder.newest,
 ) -> ModelPage:
-    """List finished models, newest first."""
-    return service.models.list(cursor, limit, Filter(owner, name))
+    """List finished models."""
+    return service.models.list(cursor, limit, Filter(owner, name, tag, favourite), sort)
 
 
 @router.get("/{model_id}", responses=problems("model_not_found", "model_not_ready", "model_corrupt"))
@@ -107,9 +111,9 @@ def get_model(service: Shared, model_id: ModelId) -> Model:
     ),
     dependencies=[JSON_ONLY],
 )
-def rename_model(service: Shared, model_id: ModelId, change: Rename) -> Model:
-    """Name a model, and its job with it. Files of it are downloaded under its name."""
-    return service.models.rename(model_id, change.name)
+def label_model(service: Shared, model_id: ModelId, change: ChangeLabels) -> Model:
+    """Change the name, the tags and the star of a model and its job. Files are downloaded under its name."""
+    return service.models.label(model_id, change)
 
 
 @router.head("/{model_id}/files/{name:path}", include_in_schema=False)

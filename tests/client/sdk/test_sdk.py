@@ -259,6 +259,11 @@ def test_what_is_in_the_bin_can_be_restored(service, photos):
         with pytest.raises(NotFound):
             client.bin.restore_job(job.id)
         assert model.rename(None).name is None
+        assert model.label(tags=["garden", "Garden"]).tags == job.label(favourite=True).tags == ["garden"]
+        assert [found.id for found in client.models(tag="GARDEN", favourite=True, sort="name")] == [model.id]
+        assert [found.id for found in client.jobs(tag="garden", favourite=False)] == []
+        with pytest.raises(InvalidRequest):
+            model.label(tags=["a,b"])
 
 
 def test_all_jobs_page_by_page(service, photos):

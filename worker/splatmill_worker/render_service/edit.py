@@ -18,6 +18,7 @@ from splatmill_worker.images.guarded import own_picture
 from splatmill_worker.render_service.conversion import background_of
 from splatmill_worker.render_service.encoding import camera_of
 from splatmill_worker.render_service.model_cache import antialias_of
+from splatmill_worker.render_service.selection import selected
 from splatmill_worker.scene import Camera
 from splatmill_worker.splat.evaluate import Score, compare
 from splatmill_worker.splat.formats import ply
@@ -96,6 +97,8 @@ def kept(gaussians: Gaussians, request: EditModel) -> Tensor:
         keep &= torch.sigmoid(gaussians.logit_opacities) >= request.min_opacity
     if request.max_size is not None:
         keep &= gaussians.log_scales.exp().amax(dim=1) <= request.max_size
+    if request.selection is not None:
+        keep &= ~torch.from_numpy(selected(gaussians.means.numpy(), request.selection))
     return keep
 
 

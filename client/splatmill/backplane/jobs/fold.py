@@ -79,6 +79,8 @@ class Fold:
             id=row.id,
             capture=row.capture,
             name=row.name,
+            tags=row.tags,
+            favourite=row.favourite,
             owner=row.owner,
             state=self.state,
             options=row.options,

@@ -42,6 +42,8 @@ class JobRow(BaseModel):
     id: str
     capture: str
     name: str | None = None
+    tags: list[str] = []
+    favourite: bool = False
     owner: Owner = DEFAULT_OWNER
     options: TrainOptions
     priority: int = 0
@@ -53,10 +55,11 @@ class JobRow(BaseModel):
     request: str | None = None
 
     def fields(self) -> dict[str, str]:
-        """Return the fields of the hash: one per attribute that is not None, with models as JSON."""
+        """Return the fields of the hash: one per attribute that is not None, with models and lists as JSON."""
+        plain = self.model_dump(mode="json", exclude_none=True) | {"tags": json.dumps(self.tags)}
         return {
             name: getattr(self, name).model_dump_json() if isinstance(value, dict) else str(value)
-            for name, value in self.model_dump(mode="json", exclude_none=True).items()
+            for name, value in plain.items()
         }
 
     @classmethod
@@ -76,6 +79,7 @@ class JobRow(BaseModel):
             check_format(plain)
             options, left_out = keep_readable(TrainOptions.model_validate, json.loads(plain["options"]))
             plain["options"] = options
+            plain["tags"] = json.loads(plain.get("tags", "[]"))
             if "verdict" in plain:
                 verdict, more = keep_readable(Verdict.model_validate, json.loads(plain["verdict"]))
                 plain["verdict"] = verdict

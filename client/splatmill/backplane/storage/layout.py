@@ -32,7 +32,7 @@ models/{id}/orbits/{orbit}/orbit.mp4        the video
 models/{id}/presentation.json               how the model is shown to people: start view, measurements, annotations
 models/{id}/poster.jpg                      its picture from the start view that was chosen for it
 models/{id}/job.json                        record of the ended job; written last: a model exists once it does
-names/{job}.json                            the name that a job was given after it was made, and its model with it
+names/{job}.json                            name, tags and star that a job was given later, and its model with it
 bin/{kind}.{id}.json                        record in the bin, kind job or capture: who it belongs to, and when it goes
 keys/{id}.json                              a key of the API: its owner, scopes, limits, and the digests of its secrets
 keys/{id}.revoked                           the key was revoked; it counts more than the record beside it
@@ -228,13 +228,13 @@ def job_cameras(job_id: str) -> str:
     return f"jobs/{job_id}/cameras.json"
 
 
-def names() -> str:
-    """Return the folder of the names that jobs were given later."""
+def labels() -> str:
+    """Return the folder of the names, tags and stars that jobs were given later."""
     return "names"
 
 
-def job_name(job_id: str) -> str:
-    """Return the path of the name that a job was given later. Only the server writes it."""
+def job_labels(job_id: str) -> str:
+    """Return the path of the name, the tags and the star that a job was given later. Only the server writes it."""
     return f"names/{job_id}.json"
 
 

@@ -5,6 +5,7 @@ from typing import Annotated, Self
 from pydantic import Field, model_validator
 
 from splatmill.schema.base import Label, Measured, Request, Response
+from splatmill.schema.resources.selections import Selection
 
 EDIT_HEADER = "Splatmill-Edit"
 """Response header of the renderer with an edited model: the `Edited` of it, as JSON."""
@@ -39,6 +40,9 @@ class EditModel(Request):
         le=1e9,
         description="Gaussians with a larger standard deviation along any axis are left out. In units of the model.",
     )
+    selection: Selection | None = Field(
+        default=None, description="Gaussians that were selected on views of the model are left out."
+    )
     name: Label | None = Field(
         default=None, description="Name of the new model. Left out, that of the model."
     )
@@ -46,8 +50,8 @@ class EditModel(Request):
 
     @model_validator(mode="after")
     def _does_something(self) -> Self:
-        if self.box is None and self.min_opacity is None and self.max_size is None:
-            raise ValueError("The edit leaves nothing out: give box, min_opacity or max_size.")
+        if all(part is None for part in (self.box, self.min_opacity, self.max_size, self.selection)):
+            raise ValueError("The edit leaves nothing out: give box, min_opacity, max_size or selection.")
         return self
 
 

@@ -37,12 +37,6 @@ class CreateJob(Request):
         return self.model_dump_json(exclude=None if with_capture else {"capture"}, exclude_defaults=True)
 
 
-class Rename(Request):
-    """A new name for a job and its model."""
-
-    name: Label | None = Field(description="A name to recognise it by; null for none.")
-
-
 def _readable_options(value: Any) -> Any:
     # A newer server may have options, or values of options, that this version does not know; its jobs, and the
     # records that it stored, must still be readable.
@@ -64,6 +58,8 @@ class Job(Response):
     id: str
     capture: str
     name: str | None = None
+    tags: list[str] = Field(default_factory=list, description="Words that it was given, also to its model.")
+    favourite: bool = Field(default=False, description="Whether it has a star, as its model has.")
     owner: Owner = DEFAULT_OWNER
     state: Annotated[JobState, BeforeValidator(_named_state)]
     options: Annotated[TrainOptions, BeforeValidator(_readable_options)]

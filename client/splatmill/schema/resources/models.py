@@ -1,5 +1,6 @@
 """Finished models, their files and their cameras."""
 
+from enum import StrEnum
 from typing import Any
 
 from pydantic import ConfigDict, Field
@@ -14,6 +15,15 @@ HELD_OUT = "held_out"
 
 TIME_LAPSE = "time_lapse"
 """Folder of a model's snapshots of its training, `000.ply` and so on."""
+
+
+class ModelOrder(StrEnum):
+    """The order of a list of models: the newest, the name, the most Gaussians or the highest PSNR first."""
+
+    newest = "newest"
+    name = "name"
+    size = "size"
+    psnr = "psnr"
 
 
 class ModelFile(Response):
@@ -33,6 +43,8 @@ class Model(Response):
     id: str
     job: str
     name: str | None = None
+    tags: list[str] = Field(default_factory=list, description="Words that it was given, also to its job.")
+    favourite: bool = Field(default=False, description="Whether it has a star, as its job has.")
     owner: Owner = DEFAULT_OWNER
     created_at: Time
     gaussians: int = Field(ge=0, description="Number of Gaussians.")
@@ -47,7 +59,7 @@ class Model(Response):
 
 
 class ModelPage(Response):
-    """A page of models, newest first."""
+    """A page of models."""
 
     models: list[Model]
     cursor: str | None = Field(

@@ -215,7 +215,7 @@ export class View extends EventTarget {
     if (source && this.kind === "webgl") this.source = await source;
     this.say("");
     if (this.source.url || this.source.bytes || this.kind !== "webgl") await this.load(this.source);
-    if (!options.camera && !options.cameras?.length && this.surface instanceof Splats) this.frameMiddle(this.surface.points);
+    if (!options.camera && !options.cameras?.length && this.surface instanceof Splats) this.frameMiddle(this.points);
     this.again();
   }
 
@@ -250,6 +250,16 @@ export class View extends EventTarget {
   /** How many Gaussians are drawn; 0 where the server draws them. */
   get gaussians() {
     return this.surface?.gaussians ?? 0;
+  }
+
+  /** The positions of the Gaussians that are drawn, x, y and z in turn; null where the server draws them. */
+  get points() {
+    return this.surface instanceof Splats ? this.surface.points : null;
+  }
+
+  /** Distance from the camera beyond which nothing is drawn. */
+  get visibleDistance() {
+    return this.visible === null ? Infinity : length(sub(this.pose.position, this.middle)) + this.visible;
   }
 
   /** The vertical field of view that shows what has to be seen, radians. */

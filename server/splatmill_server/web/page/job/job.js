@@ -5,7 +5,7 @@ import { ErrorChart } from "../chart.js";
 import { byId, h } from "../dom.js";
 import { bytes, count, decibels, moment, number, seconds } from "../format.js";
 import { FINAL, badgeKind, badgeText } from "../job_states.js";
-import { renameButton } from "../naming.js";
+import { labelButton, starButton, tagLinks } from "../labels.js";
 import { confirmAction, noticeOf, notify, startShell } from "../shell.js";
 import { Course } from "./course.js";
 import { LiveScene } from "./live_scene.js";
@@ -78,6 +78,7 @@ function begin() {
 
 function showName() {
   byId("name").textContent = job.name || `Job ${id}`;
+  byId("tags").replaceChildren(...[tagLinks(job, "/jobs")].filter((list) => list !== null));
 }
 
 /** @param {any} record */
@@ -277,15 +278,15 @@ function showActions() {
 
 function actions() {
   const other = h("a", { class: "button", href: `/?capture=${encodeURIComponent(job.capture)}&options_of=${encodeURIComponent(job.id)}` }, course.final ? "Train with other options" : "New job with other options");
-  const rename = renameButton(address, () => job.name ?? "", (record) => {
+  const labels = [labelButton(address, () => job, (record) => {
     job = record;
     showName();
     again();
-  });
+  }), starButton(address, job, (record) => (job = record))];
   if (!course.final) {
-    return [other, rename, h("button", { type: "button", class: "danger", disabled: job.cancel_requested, onclick: cancel }, "Cancel")];
+    return [other, ...labels, h("button", { type: "button", class: "danger", disabled: job.cancel_requested, onclick: cancel }, "Cancel")];
   }
-  return [other, rename, course.state === "succeeded" ? null : h("button", { type: "button", onclick: restart }, "Restart")].filter((part) => part !== null);
+  return [other, ...labels, course.state === "succeeded" ? null : h("button", { type: "button", onclick: restart }, "Restart")].filter((part) => part !== null);
 }
 
 async function cancel() {

@@ -6,6 +6,7 @@ import { h } from "../dom.js";
 import { ago, moment, seconds } from "../format.js";
 import { FINAL, RUNNING, badgeKind, badgeText } from "../job_states.js";
 import { exampleOffer } from "../example.js";
+import { starButton, tagLinks } from "../labels.js";
 import { listing } from "./listing.js";
 import { confirmAction, startShell } from "../shell.js";
 
@@ -24,8 +25,10 @@ function entry(job) {
         h("span", { class: "badge", "data-state": badgeKind(job.state) }, badgeText(job.state, job.cancel_requested))),
       !done && progress?.total
         ? h("progress", { value: progress.done, max: progress.total, "aria-label": `${name}: ${progress.stage}` }) : null,
+      tagLinks(job, "/jobs"),
       h("p", { class: "meta", title: `Created ${moment(job.created_at)}` }, facts(job).join(" · "))),
     h("div", { class: "actions" },
+      starButton(`/v1/jobs/${job.id}`, job, (record) => list.update(record)),
       done ? null : h("button", { class: "quiet small", type: "button", "data-focus": "cancel", disabled: job.cancel_requested, onclick: () => cancel(job) }, "Cancel", hidden(name)),
       done ? h("button", { class: "quiet small", type: "button", "data-focus": "delete", onclick: () => remove(job) }, "Delete", hidden(name)) : null));
 }
@@ -96,7 +99,7 @@ await startShell();
 const list = await listing({
   noun: "jobs",
   limit: 30,
-  query: ({ name, state }) => ({ name, state: state === "running" ? RUNNING : state }),
+  query: ({ state, ...labels }) => ({ ...labels, state: state === "running" ? RUNNING : state }),
   entry,
   deleteAll: removeAll,
   deletable: (job) => FINAL.includes(job.state),

@@ -23,6 +23,7 @@ export async function listing({ noun, limit, query, entry, empty, deleteAll, del
   const box = byId("list");
   const more = /** @type {HTMLButtonElement} */ (byId("more"));
   const count = byId("count");
+  const tags = /** @type {HTMLDataListElement} */ (byId("known-tags"));
   /** @type {Map<string, {record: any, element: HTMLElement}>} */
   const shown = new Map();
   /** @type {string | null} */
@@ -34,7 +35,8 @@ export async function listing({ noun, limit, query, entry, empty, deleteAll, del
 
   for (const [name, value] of new URLSearchParams(location.search)) {
     const control = form.elements.namedItem(name);
-    if (control instanceof HTMLInputElement || control instanceof HTMLSelectElement) control.value = value;
+    if (control instanceof HTMLInputElement && control.type === "checkbox") control.checked = control.value === value;
+    else if (control instanceof HTMLInputElement || control instanceof HTMLSelectElement) control.value = value;
   }
 
   // Several records are selected by checkboxes, which are shown only then.
@@ -74,6 +76,11 @@ export async function listing({ noun, limit, query, entry, empty, deleteAll, del
     return h("label", { class: "select" }, check);
   }
 
+  /** Whether a tag is among those of the records that were loaded. @param {string} tag */
+  function knows(tag) {
+    return [...tags.options].some(({ value }) => value === tag);
+  }
+
   /** @param {any} record */
   function show(record) {
     const element = entry(record);
@@ -82,10 +89,12 @@ export async function listing({ noun, limit, query, entry, empty, deleteAll, del
     if (known) known.element.replaceWith(element);
     else box.append(element);
     shown.set(record.id, { record, element });
+    for (const tag of record.tags) if (!knows(tag)) tags.append(h("option", { value: tag }));
   }
 
   function say() {
-    const filtered = Object.values(filters()).some(Boolean);
+    const { sort, ...chosen } = filters();
+    const filtered = Object.values(chosen).some(Boolean);
     more.hidden = cursor === null;
     box.hidden = shown.size === 0;
     if (shown.size > 0) count.textContent = `${shown.size}${cursor ? " or more" : ""} ${shown.size === 1 ? noun.slice(0, -1) : noun}`;
@@ -130,9 +139,12 @@ export async function listing({ noun, limit, query, entry, empty, deleteAll, del
     reload();
   });
   form.addEventListener("input", (event) => {
+    const field = event.target;
     clearTimeout(timer);
-    timer = setTimeout(reload, event.target instanceof HTMLSelectElement ? 0 : TYPING_MS);
+    if (field instanceof HTMLInputElement && field.list && field.value && !knows(field.value)) return; // a tag counts once it is whole
+    timer = setTimeout(reload, field instanceof HTMLInputElement && field.type === "search" ? TYPING_MS : 0);
   });
+  byId("tag").addEventListener("change", reload);
   more.addEventListener("click", async () => {
     const last = shown.size;
     await load();

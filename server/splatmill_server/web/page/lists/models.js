@@ -6,6 +6,7 @@ import { putInBin } from "../bin.js";
 import { append, byId, h } from "../dom.js";
 import { ago, bytes, decibels, moment, number } from "../format.js";
 import { exampleOffer } from "../example.js";
+import { starButton, tagLinks } from "../labels.js";
 import { listing } from "./listing.js";
 import { pictureOf } from "../picture.js";
 import { openSharing } from "../sharing.js";
@@ -23,9 +24,11 @@ function entry(model) {
     h("div", { class: "body" },
       h("a", { class: "whole", href: `/models/${model.id}` }, name),
       h("p", { class: "figures" }, `${decibels(model.psnr)} · ${number(model.gaussians)} Gaussians · ${bytes(model.bytes)}`),
+      tagLinks(model, "/models"),
       h("div", { class: "foot" },
         h("span", { title: moment(model.created_at) }, ago(model.created_at)),
         h("span", { class: "actions push" },
+          starButton(modelAddress(model.id), model, (record) => list.update(record)),
           h("button", { class: "quiet small", type: "button", onclick: () => openSharing(modelAddress(model.id), name) }, "Share", h("span", { class: "visually-hidden" }, ` ${name}`)),
           h("button", { class: "quiet small", type: "button", onclick: () => removeAll([model]) }, "Delete", h("span", { class: "visually-hidden" }, ` ${name}`))))));
 }
@@ -122,7 +125,7 @@ await startShell();
 const list = await listing({
   noun: "models",
   limit: 24,
-  query: ({ name }) => ({ name }),
+  query: (filters) => filters,
   entry,
   deleteAll: removeAll,
   compare: ([left, right]) => location.assign(at(`/compare?${new URLSearchParams({ left, right })}`)),

@@ -1,4 +1,4 @@
-// Cropping and cleaning: a box drawn in the view, a least opacity, a largest size. The view shows what is left out; the server
+// Cropping and cleaning: a box drawn in the view, a least opacity, a largest size, a selection. The view shows what is left out; the server
 // measures what that does to the held-out photos, and makes a new model of what is left. This one is kept.
 
 import { send } from "../api.js";
@@ -7,6 +7,7 @@ import { number } from "../format.js";
 import { noticeOf } from "../shell.js";
 import { BoxHandles, boxAround } from "../viewer/box_handles.js";
 import { LOADING } from "../viewer/errors.js";
+import { Selecting } from "./selecting.js";
 
 /**
  * @import {Stage} from "./stage.js"
@@ -50,6 +51,15 @@ export class Edit {
     this.sizeLabel = h("label", { for: "edit-size" });
     this.look = h("select", { id: "edit-look", onchange: () => this.draw() },
       h("option", { value: "dimmed" }, "dimmed"), h("option", { value: "hidden" }, "hidden"), h("option", { value: "shown" }, "as ever"));
+    this.selecting = new Selecting({
+      began: () => {
+        // A box that nobody has moved is not what a selection is drawn for.
+        if (!this.before.length) this.crop.checked = false;
+        change();
+      },
+      changed: change,
+      factor: () => this.factor,
+    });
     this.state = h("div", { role: "status" });
     this.undoButton = h("button", { type: "button", class: "quiet", disabled: true, onclick: () => this.undo() }, "Undo");
     this.measureButton = h("button", { type: "button", onclick: () => void this.run(true) }, "Measure what it does");
@@ -63,6 +73,7 @@ export class Edit {
       h("div", { class: "row" }, this.crop, h("label", { for: "edit-crop" }, "Keep only what lies in the box, whose sides are moved by the handles in the view")),
       h("div", { class: "box-ends" }, legends.map((legend, i) => h("fieldset", {}, h("legend", {}, legend), h("div", { class: "row" }, this.ends[i][0], "to", this.ends[i][1])))),
       this.unit,
+      this.selecting.fieldset,
       h("div", { class: "row" },
         h("div", { class: "field" }, h("label", { for: "edit-opacity" }, "Least opacity, 0 to 0.99"), this.opacity),
         h("div", { class: "field" }, this.sizeLabel, this.size),
@@ -86,6 +97,7 @@ export class Edit {
       if (done) this.change();
       else this.draw();
     });
+    this.selecting.attach(view);
     this.chosen = this.snapshot();
     this.draw();
   }
@@ -94,6 +106,7 @@ export class Edit {
   turn(on) {
     this.on = on;
     this.panel.hidden = !on;
+    if (!on) this.selecting.take(null);
     this.draw();
   }
 
@@ -103,7 +116,7 @@ export class Edit {
   }
 
   snapshot() {
-    return JSON.stringify({ box: this.box, crop: this.crop.checked, opacity: this.opacity.value, size: this.size.value });
+    return JSON.stringify({ box: this.box, crop: this.crop.checked, opacity: this.opacity.value, size: this.size.value, selection: this.selecting.chosen });
   }
 
   /** Take over what was chosen, and keep what was before it. */
@@ -118,10 +131,11 @@ export class Edit {
     const chosen = this.before.pop();
     if (!chosen) return;
     this.chosen = chosen;
-    const { box, crop, opacity, size } = JSON.parse(chosen);
+    const { box, crop, opacity, size, selection } = JSON.parse(chosen);
     this.box = box;
     this.crop.checked = crop;
     [this.opacity.value, this.size.value] = [opacity, size];
+    this.selecting.choose(selection);
     this.draw();
     if (!this.before.length) this.opacity.focus();
   }
@@ -152,10 +166,11 @@ export class Edit {
     });
     this.unit.textContent = unit ? `Lengths are in ${unit}.` : "Lengths are in units of the model. Measure sets another unit.";
     this.sizeLabel.textContent = `Largest size, in ${unit ?? "units"}`;
+    this.selecting.farLabel.textContent = `Only up to a distance, in ${unit ?? "units"}`;
     this.undoButton.disabled = !this.before.length;
     const [opacity, size] = [Number(this.opacity.value) || 0, Number(this.size.value) / factor || 0];
     this.view?.leaveOut(on && this.look.value !== "shown" ? {
-      box: crop.checked ? this.box : null, opacity, size: size > 0 ? size : Infinity, hidden: this.look.value === "hidden",
+      box: crop.checked ? this.box : null, opacity, size: size > 0 ? size : Infinity, hidden: this.look.value === "hidden", mask: this.selecting.mask,
     } : null);
   }
 
@@ -167,9 +182,9 @@ export class Edit {
     wrong?.focus();
     if (wrong === this.opacity) return "The least opacity is a number from 0 to 0.99.";
     if (wrong) return "The largest size is a number over 0, or left empty.";
-    if (this.crop.checked || Number(this.opacity.value) > 0 || Number(this.size.value) > 0) return "";
+    if (this.crop.checked || Number(this.opacity.value) > 0 || Number(this.size.value) > 0 || this.selecting.request) return "";
     this.crop.focus();
-    return "Nothing would change: keep only the box, or give a least opacity or a largest size.";
+    return "Nothing would change: keep only the box, select something, or give a least opacity or a largest size.";
   }
 
   /** Ask the server for the edit. @param {boolean} preview */
@@ -179,7 +194,9 @@ export class Edit {
       this.state.replaceChildren(h("p", { class: "error" }, problem));
       return;
     }
+    const selection = this.selecting.request;
     const edit = {
+      ...(selection ? { selection } : {}),
       ...(this.crop.checked ? { box: this.box } : {}),
       ...(Number(this.opacity.value) > 0 ? { min_opacity: Number(this.opacity.value) } : {}),
       ...(Number(this.size.value) > 0 ? { max_size: Number(this.size.value) / this.factor } : {}),

@@ -11,7 +11,7 @@ import { showOrbit } from "./orbit.js";
 import { Stage } from "./stage.js";
 import { binned } from "../bin.js";
 import { figures } from "../figures.js";
-import { renameButton } from "../naming.js";
+import { labelButton, starButton, tagLinks } from "../labels.js";
 import { originOf } from "./origin.js";
 import { openSharing } from "../sharing.js";
 import { confirmAction, noticeOf, startShell } from "../shell.js";
@@ -95,6 +95,7 @@ function showName(model) {
   const name = model.name || `Model ${model.id}`;
   document.title = `${name} - Splatmill`;
   byId("title").textContent = name;
+  byId("tags").replaceChildren(...[tagLinks(model, "/models")].filter((list) => list !== null));
 }
 
 /** @param {Shown} shown */
@@ -102,10 +103,11 @@ function actions({ model, address }) {
   const has = model.files.some((/** @type {any} */ file) => file.name === "report.html");
   return [
     h("button", { type: "button", onclick: () => openSharing(address, model.name || `Model ${model.id}`) }, "Share"),
-    renameButton(address, () => model.name ?? "", (record) => {
-      model.name = record.name;
+    labelButton(address, () => model, (record) => {
+      Object.assign(model, { name: record.name, tags: record.tags });
       showName(model);
     }),
+    starButton(address, model, (record) => (model.favourite = record.favourite)),
     has && h("a", { class: "button", href: `${address}/files/report.html`, target: "_blank", rel: "noopener" }, "Report"),
     h("a", { class: "button", href: `/jobs/${encodeURIComponent(model.job)}` }, "Job"),
     h("button", { class: "danger", type: "button", onclick: () => remove(model) }, "Delete"),

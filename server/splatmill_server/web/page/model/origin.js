@@ -14,6 +14,7 @@ export async function originOf(report) {
   const parts = [
     edit.box && "what lies outside of a box",
     edit.min_opacity && `Gaussians of less opacity than ${edit.min_opacity}`,
+    edit.selection && "what was selected by hand",
     edit.max_size && `Gaussians larger than ${Number(edit.max_size.toPrecision(3))} units`,
   ].filter(Boolean);
   const without = parts.length > 1 ? `${parts.slice(0, -1).join(", ")} and ${parts.at(-1)}` : parts[0];

@@ -8,7 +8,11 @@
  */
 import { ViewerError } from "./errors.js";
 import { MODIFIER, parametersOf } from "./left_out.js";
+import { ROW } from "./selection.js";
 import { opened } from "./source.js";
+
+/** A mask without any Gaussian. */
+const NOTHING = new Uint8Array(ROW);
 
 /** Name of a uniform: the centre and radius of the sphere outside of which nothing is drawn; radius 0 draws all. */
 const SPHERE = "visible_sphere";
@@ -93,6 +97,10 @@ export class Splats {
     this.picker = null;
     /** @type {LeftOut | null} */
     this.limits = null;
+    /** The mask in `texture`. @type {Uint8Array | null} */
+    this.mask = null;
+    /** @type {any} */
+    this.texture = null;
     this.gaussians = 0;
     this.loads = 0;
   }
@@ -138,7 +146,7 @@ export class Splats {
 
   /** The positions of the Gaussians, x, y and z in turn; null where they are not known. @returns {Float32Array | null} */
   get points() {
-    return this.app.assets.get(this.splats?.gsplat.asset)?.resource.centers ?? null;
+    return this.app?.assets.get(this.splats?.gsplat.asset)?.resource.centers ?? null;
   }
 
   /** Show what an edit would leave out, dimmed or not at all; null shows everything as ever. @param {LeftOut | null} limits */
@@ -148,8 +156,20 @@ export class Splats {
     const component = this.splats?.gsplat;
     if (!component || !changed) return;
     component.setWorkBufferModifier(limits && { glsl: MODIFIER });
+    if (limits) component.setParameter("left_out_mask", this.textureOf(limits.mask ?? NOTHING));
     for (const [name, value] of Object.entries(limits ? parametersOf(limits) : {})) component.setParameter(name, value);
     component.workBufferUpdate = this.pc.WORKBUFFER_UPDATE_ONCE;
+  }
+
+  /** The texture of a mask, which takes the place of the one before. @param {Uint8Array} mask  in rows of ROW */
+  textureOf(mask) {
+    const { pc, app } = this;
+    if (this.mask !== mask) {
+      this.texture?.destroy();
+      this.texture = pc.Texture.createDataTexture2D(app.graphicsDevice, "mask", ROW, mask.length / ROW, pc.PIXELFORMAT_R8, [mask]);
+      this.mask = mask;
+    }
+    return this.texture;
   }
 
   /** @param {number} width @param {number} height  of the drawing buffer, in pixels */
@@ -203,6 +223,7 @@ export class Splats {
 
   dispose() {
     this.picker?.destroy();
+    this.texture?.destroy();
     const { app } = this;
     this.app = null;
     app?.destroy();
