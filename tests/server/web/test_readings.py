@@ -23,7 +23,7 @@ from tests.support.programs import node
 
 PROGRAM = """
 import fs from "node:fs";
-import { levels } from "./measure.js";
+import { levels } from "./looking/measure.js";
 import { onMasks } from "./remarks.js";
 import { namesIn } from "./zip.js";
 const { pictures, accepted, zip } = JSON.parse(fs.readFileSync(0));

@@ -3,7 +3,7 @@
 import { namesIn } from "./zip.js";
 import { fits, sort, suffix, withoutTop } from "./kinds.js";
 import { onMasks, places, remarks } from "./remarks.js";
-import { verdicts } from "./verdicts.js";
+import { verdicts } from "./looking/verdicts.js";
 
 /**
  * @typedef {object} Item
@@ -19,12 +19,13 @@ import { verdicts } from "./verdicts.js";
  * @property {"waiting" | "read" | "unreadable" | "unchecked"} state
  * @property {number} width
  * @property {number} height
- * @property {import("./measure.js").Measures | null} measures
+ * @property {import("./looking/measure.js").Measures | null} measures
  * @property {Uint32Array | null} levels number of pixels of each level of a mask; null while not known
  * @property {string | null} thumbnail address
+ * @property {Blob | null} picture what lies there
  * @property {string | null} lost why its bytes cannot be read
  * @property {string[] | null} inside names of the files in an archive; null where they are not known
- * @property {import("./verdicts.js").Verdict} verdict
+ * @property {import("./looking/verdicts.js").Verdict} verdict
  * @property {boolean} stored whether the capture holds it
  * @property {import("../api.js").Problem | null} problem why the server refused it
  */
@@ -82,7 +83,7 @@ export class Items {
       /** @type {Item} */
       const item = {
         id: ++this.count, path: free, file, role: null, name: free, kind: "ignored", named: false, left: false, digest: null, state: "waiting", width: 0, height: 0,
-        measures: null, levels: null, thumbnail: null, lost: null, inside: null, verdict: { kind: "waiting", text: "" }, stored: false, problem: null,
+        measures: null, levels: null, thumbnail: null, picture: null, lost: null, inside: null, verdict: { kind: "waiting", text: "" }, stored: false, problem: null,
       };
       this.byPath.set(free, item);
       added.push(item);

@@ -10,7 +10,8 @@ import { documentsIn } from "./documents.js";
 import { chosen, dropped } from "./given.js";
 import { Items } from "./items.js";
 import { suffix } from "./kinds.js";
-import { Looking } from "./looking.js";
+import { Looking } from "./looking/looking.js";
+import { Overlap } from "./looking/overlap.js";
 import { OptionsForm } from "./options.js";
 import { Start } from "./start.js";
 import { forget, recall } from "./remembered.js";
@@ -40,6 +41,7 @@ const items = new Items(info.accepted, info.limits.max_image_pixels);
 const form = new OptionsForm(options, estimateSoon);
 const gallery = new Gallery(byId("photos"), byId("others"), byId("more"), toggle);
 const looking = new Looking(onLooked);
+const overlap = new Overlap(redraw);
 const start = new Start(items, form, { redraw: () => redraw(), problem: refused });
 
 byId("settings-first").append(form.first);
@@ -136,12 +138,13 @@ async function take(given) {
   redraw();
 }
 
-/** @param {import("./look.js").Looked} looked */
+/** @param {import("./looking/look.js").Looked} looked */
 function onLooked(looked) {
   const item = items.all.find(({ id }) => id === looked.id);
   if (!item) return; // removed meanwhile
   const { thumbnail, error, ...seen } = looked;
   Object.assign(item, seen);
+  item.picture = thumbnail;
   if (thumbnail) item.thumbnail = URL.createObjectURL(thumbnail);
   if (error) item.lost = "The file cannot be read. It may have been moved or changed; give it again.";
   start.compare(item);
@@ -174,7 +177,10 @@ function redraw() {
   byId("drop").classList.toggle("small-drop", any);
   byId("example").hidden ||= any;
   byId("summary").textContent = summary();
-  byId("remarks").replaceChildren(...items.remarks.map((sentence) => h("li", {}, sentence)));
+  // Where cameras come with the photos, nothing has to be recognised in two of them.
+  overlap.consider(items.size(start.held, Infinity).posed ? [] : items.photos.filter((item) => !item.left));
+  byId("remarks").dataset.compared = String(overlap.compared);
+  byId("remarks").replaceChildren(...overlap.sentences.map((sentence) => h("li", { class: "error" }, sentence)), ...items.remarks.map((sentence) => h("li", {}, sentence)));
   if (items.photos.every((item) => item.state !== "waiting" || item.lost)) byId("checked").textContent = summary();
   const bad = advised().length;
   const leave = byId("leave-all");

@@ -39,7 +39,7 @@ const DARK = 36;
 const BRIGHT = 240;
 
 /** Cells of 256 in which the hashes of two nearly equal photos differ at most. */
-const NEAR = 10;
+export const NEAR = 10;
 
 /** Photos before a photo that it is compared with: nearly equal ones were taken one after the other. */
 const LOOKED_BACK = 12;
