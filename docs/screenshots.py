@@ -29,6 +29,12 @@ FLAGS = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshad
 CHECKED = "() => /photos/.test(summary.textContent) && !/checked/.test(summary.textContent)"
 """Whether the page has looked at all photos."""
 
+DRAWN = """() => {
+  const view = document.querySelector(".view");
+  return view?.dataset.frames > 0 && !view.querySelector("img") && !view.querySelector(".said").textContent;
+}"""
+"""Whether the view shows the model, and neither its picture nor that it is being loaded."""
+
 PHOTOS = 30
 OPTIONS = {"time_budget": "60s"}
 
@@ -109,9 +115,9 @@ def walk(pages: dict[str, Page], http: httpx.Client, photos: list[Path]) -> None
             ("share", link),
         ):
             page.goto(address)
-            if name in ("model", "share"):
-                page.locator(".view").wait_for(timeout=60_000)
-            page.wait_for_timeout(6000 if name in ("model", "share", "report") else 1500)
+            if name in ("model", "share", "report"):
+                page.wait_for_function(DRAWN, timeout=300_000, polling=500)
+            page.wait_for_timeout(1500)
             take(page, f"{name}-{theme}")
 
 

@@ -488,6 +488,15 @@ def test_digests_are_right_without_the_browsers_own(page: Page) -> None:
     assert page.evaluate(script, size) == [expected, expected]
 
 
+def test_empty_lists_leave_no_gap_above_the_photos(page: Page, photos: Path) -> None:
+    give(opened(page), *sorted(photos.iterdir()))
+    page.evaluate("document.getElementById('remarks').replaceChildren()")
+    tools, tiles = (page.locator(f"#{name}").bounding_box() for name in ("tools", "photos"))
+    assert tools is not None
+    assert tiles is not None
+    assert tiles["y"] - tools["y"] - tools["height"] < 24, "one distance of the stack, and not three"
+
+
 def test_axe_finds_nothing_serious(service: Up, open_window: Open, photos: Path) -> None:
     axe = npm_package("axe-core") / "axe.min.js"
     visit = open_window(service)
