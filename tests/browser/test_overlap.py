@@ -1,7 +1,7 @@
 """What the page that takes photos says of them together, before anything is sent: photos that share nothing, that all
-show one view, and that are all blurred; and that it says nothing of real captures.
+show one view, and that are all blurred; and that there is no warning of real captures.
 
-Not proved here: that structure from motion succeeds where nothing is said.
+Not proved here: that structure from motion succeeds where there is no warning.
 """
 
 from __future__ import annotations
@@ -49,14 +49,14 @@ def photos_of(capture: str) -> list[Path]:
 
 
 def warnings(page: Page, photos: list[Path]) -> Locator:
-    """Give photos, wait until they are compared, and return what is said of them together."""
+    """Give photos, wait until they are compared, and return the warnings."""
     give(opened(page), *photos)
     expect(page.locator("#remarks")).to_have_attribute("data-compared", "true", timeout=120_000)
     return page.locator("#remarks .error")
 
 
 @pytest.mark.parametrize("capture", CAPTURES)
-def test_nothing_is_said_of_real_captures(page: Page, tmp_path: Path, capture: str) -> None:
+def test_real_captures_get_no_warning(page: Page, tmp_path: Path, capture: str) -> None:
     photos = photos_of(capture)
     # Over 48, they are compared in runs.
     said = warnings(page, small(tmp_path, photos[:52]))
