@@ -18,17 +18,16 @@ from splatmill.schema.files.photos import (
     UNREAD_KINDS,
     VIDEO_FORMATS,
 )
-from splatmill_worker.images import guarded, mask_levels, overlay, prepare
+from splatmill_worker.images import faces, guarded, mask_levels, overlay, panoramas, prepare
 from splatmill_worker.images.archives import archive, zip_names
 from splatmill_worker.images.colors import PRIMARIES, TRANSFERS, Colors
-from splatmill_worker.images.lens import PINHOLE_MODELS
+from splatmill_worker.images.lens import PANORAMA, PINHOLE_MODELS
 from splatmill_worker.images.no_photo import TRAITS
 from splatmill_worker.images.photo_colors import PhotoColors
 from splatmill_worker.readers import scan
 from splatmill_worker.readers.colmap_files import MODELS
 from splatmill_worker.scene import MIN_SHOWN
 from splatmill_worker.sfm.posed import colmap_model, model_files, points, polycam, triangulation
-from splatmill_worker.sfm.posed.camera_models import is_panoramic
 from tests.support.inputs.example import answer
 from tests.support.inputs.table import EXAMPLES
 
@@ -81,6 +80,13 @@ def _photos() -> list[str]:
         Photos without EXIF are taken to be of one camera for each folder and each video. Where the motion of the camera
         does not determine them, pixels are taken to be square, and the focal length to be that of EXIF, or else 1.2
         times the longest side.
+
+        A photo is a panorama if its XMP says so (`GPano:ProjectionType`, equirectangular), or if it is twice as wide as
+        high, its left and right edges meet (up to {panoramas.SEAM:g} times the difference of two columns), and its top
+        and bottom are of one colour (up to {panoramas.POLES:.0%} of the differences of other rows); a warning says
+        where that is assumed. Where only its left and right edges meet, its folder decides, and a warning names both
+        readings. Panoramas may lie beside other photos, and are trained as the
+        {len(faces.FACES)} faces of a cube ([Photographing](photographing.md#360-degree-photos)).
 
         A file whose name cannot be stored (`x:1.jpg`, a space at an end, bytes that are not UTF-8) is stored under a
         similar name, and both names are given. A path of more than {MAX_PARTS} parts is left out; a part of more than
@@ -247,8 +253,8 @@ def _cameras() -> list[str]:
 
 
 def _undistorted(model: str) -> str:
-    if is_panoramic(model):
-        return "refused"
+    if model == PANORAMA:
+        return "cut into the faces of a cube"
     return "as they are" if model in PINHOLE_MODELS else "undistorted to a pinhole"
 
 

@@ -171,6 +171,20 @@ def looked_at(centers: Float, axes: Float, ridge: float = 1e-3, weights: Float |
     return target
 
 
+@dataclass(frozen=True)
+class Face:
+    """The part of a panorama that a view shows.
+
+    panorama: name of the panorama.
+    width: of the panorama in pixels; it is half as high.
+    rotation: from the panorama's frame (x right, y down, z towards its middle) to the view's camera, [3,3].
+    """
+
+    panorama: str
+    width: int
+    rotation: Float
+
+
 MIN_SHOWN = 128
 """Level of a mask, 0 to 255, from which a pixel is shown, unless all masks together are pictures of two labels."""
 
@@ -188,6 +202,7 @@ class View:
     upright: whether the camera describes the photo with its EXIF orientation applied.
     other: the view with the other `upright`, where the camera fits the photo both ways; None: it is decided.
     shown_from: level of the mask, 0 to 255, from which a pixel is shown.
+    face: which part of the photo and of its mask the view shows, where that is a panorama; None: all of it.
     """
 
     name: str
@@ -199,6 +214,12 @@ class View:
     upright: bool = True
     other: View | None = None
     shown_from: int = MIN_SHOWN
+    face: Face | None = None
+
+    @property
+    def photo(self) -> str:
+        """Name of the photo: of a face, that of the panorama."""
+        return self.name if self.face is None else self.face.panorama
 
 
 class PointViews(NamedTuple):

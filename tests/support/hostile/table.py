@@ -10,6 +10,7 @@ from tests.support.hostile.table_headers import HEADERS
 from tests.support.hostile.table_lenses import LENSES
 from tests.support.hostile.table_models import MODELS
 from tests.support.hostile.table_others import OTHERS
+from tests.support.hostile.table_panoramas import PANORAMAS
 from tests.support.hostile.table_poses import POSES
 from tests.support.hostile.table_presentation import PRESENTATION
 from tests.support.hostile.table_programs import PROGRAMS
@@ -33,4 +34,5 @@ HOSTILE: tuple[Hostile, ...] = (
     *MODELS,
     *DECODERS,
     *COLORS,
+    *PANORAMAS,
 )

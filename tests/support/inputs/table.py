@@ -17,6 +17,7 @@ from PIL import Image
 
 from tests.support import unmarked_zip
 from tests.support.inputs.example import Example, Kind
+from tests.support.panoramas import gpano, striped
 from tests.support.posed_sets import COUNT, NAMES, frames, model, photos, transforms, viewmat, zip_of
 from tests.support.program_files import PROGRAMS, SIZE
 
@@ -248,6 +249,19 @@ def clear(folder: Path) -> None:
     Image.new("RGBA", (64, 48)).save(folder / "4.png")
 
 
+def of_spheres(folder: Path, *, xmp: bytes = b"", with_photos: bool = False) -> None:
+    for seed in range(4):
+        striped(folder / f"sphere_{seed}.jpg", xmp, seed)
+    if with_photos:
+        plain(folder)
+
+
+def spheres_with_cameras(folder: Path) -> None:
+    photos(folder / "images", size=(64, 32))
+    model(folder / "sparse/0")
+    (folder / "sparse/0/cameras.txt").write_text("1 EQUIRECTANGULAR 64 32 64 32\n")
+
+
 MIRRORED = np.diag([1.0, 1.0, -1.0, 1.0]).tolist()
 
 EXAMPLES: tuple[Example, ...] = (
@@ -271,6 +285,31 @@ EXAMPLES: tuple[Example, ...] = (
     Example("Photos", "nothing but a text", alone("notes.txt"), "refused"),
     Example("Photos", "depth maps in a folder depth", maps("depth/{}.png", True, True), "used with a remark"),
     Example("Photos", "nothing but depth maps of 16 bits", maps("{}.png", True), "refused"),
+    Example(
+        "Photos",
+        "panoramas by their XMP",
+        partial(of_spheres, xmp=gpano(ProjectionType="equirectangular")),
+        "used",
+    ),
+    Example("Photos", "panoramas by their edges alone", of_spheres, "used with a remark"),
+    Example(
+        "Photos",
+        "panoramas beside ordinary photos",
+        partial(of_spheres, xmp=gpano(ProjectionType="equirectangular"), with_photos=True),
+        "used",
+    ),
+    Example(
+        "Photos",
+        "parts of panoramas beside ordinary photos",
+        partial(
+            of_spheres,
+            xmp=gpano(
+                ProjectionType="equirectangular", CroppedAreaImageHeightPixels=900, FullPanoHeightPixels=2000
+            ),
+            with_photos=True,
+        ),
+        "used with a remark",
+    ),
     Example("Masks", "nothing but a folder masks", maps("masks/{}.png"), "refused"),
     Example("Masks", "nothing but masks, whatever they are called", maps("{}.png"), "refused"),
     Example("Masks", "masks/NAME.PNG", masked("masks/{}.PNG"), "used"),
@@ -287,6 +326,7 @@ EXAMPLES: tuple[Example, ...] = (
     ),
     Example("Cameras", "a COLMAP model two folders down", partial(colmap, top="export/scene"), "used"),
     Example("Cameras", "the same in a zip", zipped_set, "used"),
+    Example("Cameras", "a COLMAP model of panoramas", spheres_with_cameras, "used"),
     Example("Cameras", "the same in a zip by a Japanese Windows", of_windows, "used with a remark"),
     Example(
         "Cameras",

@@ -13,7 +13,7 @@ from pydantic import PlainValidator
 
 from splatmill.schema.files.photos import MIN_PHOTO_SIDE
 from splatmill_worker.errors import UnusablePicture
-from splatmill_worker.images import exif, guarded, transparency
+from splatmill_worker.images import exif, guarded, panoramas, transparency
 from splatmill_worker.images.copies import SMALL_SIDE, small_grey
 from splatmill_worker.images.decode import (
     UPRIGHT,
@@ -27,10 +27,6 @@ from splatmill_worker.images.decode import (
 from splatmill_worker.images.no_photo import Kind, kind_of
 from splatmill_worker.images.photo_colors import PhotoColors
 from splatmill_worker.wording import plain
-
-POLE_SPREAD = 0.25
-"""Spread of grey levels in the first and last row of a panorama over that of a usual row, at most: they are half a
-pixel from the poles."""
 
 GIVE = "; give JPEG, PNG, WebP, TIFF, HEIC or AVIF photos, videos or zips"
 
@@ -52,8 +48,7 @@ class Picture:
     exif: the tags that structure from motion uses.
     several: whether the file holds further pictures.
     colors: how its colours become sRGB, as `PhotoColors.remark` says it.
-    projection: of a panorama, by its XMP.
-    closed: whether it has the shape and the edges of a panorama of 360 by 180 degrees.
+    sphere: what says that it is a panorama.
     alpha: its smallest and largest alpha.
     kind: what it seems to be, if no photo.
     small: the grey picture at low resolution, upright, of `copies.small_grey`.
@@ -65,8 +60,7 @@ class Picture:
     several: bool
     colors: str
     small: Annotated[Pixels, PlainValidator(_small)] = field(compare=False)
-    projection: str | None = None
-    closed: bool = False
+    sphere: panoramas.Sphere = ""
     alpha: transparency.Extent = (255, 255)
     kind: Kind = ""
 
@@ -86,17 +80,21 @@ def examine(path: Path, name: str) -> Picture | str:
                 width, height = upright_size(image)
                 several = guarded.several(image)
                 colors = PhotoColors.of(image, tags(image), path).remark(image.mode)
-                found, projection = exif.read(image), exif.projection(image)
-                wide = width == 2 * height
+                found, stated = exif.read(image), panoramas.stated(image)
+                if stated not in ("", "stated"):
+                    return stated
                 turn = UPRIGHT.get(orientation(image))
-                if image.format == "JPEG" and not wide:
+                wide = panoramas.is_wide(width, height)
+                if image.format == "JPEG":
                     # This decodes at the smallest DCT scale that suffices, and still reads the whole file.
-                    image.draft(None, (SMALL_SIDE, SMALL_SIDE))
+                    image.draft(None, panoramas.SIZE if wide else (SMALL_SIDE, SMALL_SIDE))
                 mode = image.mode
                 with guarded.room(image):
                     photo = whole(image, name)
                     check_numbers(image, name)
-                closed = wide and _is_closed(photo)
+                sphere: panoramas.Sphere = "stated" if stated else ""
+                if wide and not stated:
+                    sphere = panoramas.by_edges(photo if turn is None else photo.transpose(turn))
                 alpha = transparency.extent(photo)
                 kind = kind_of(mode, photo)
                 small = small_grey(photo)
@@ -105,14 +103,4 @@ def examine(path: Path, name: str) -> Picture | str:
         return error.reason + (GIVE if error.reason == guarded.UNKNOWN else "")
     except OSError as error:
         return f"it cannot be read: {plain(error)}"
-    return Picture(width, height, found, several, colors, small, projection, closed, alpha, kind)
-
-
-def _is_closed(photo: Image.Image) -> bool:
-    """Whether the edges of a picture are those of a sphere: the left one continues the right one, and the upper and the
-    lower one are a point each, so of one colour."""
-    values = np.asarray(photo.convert("L"), np.float64)
-    columns = np.abs(np.diff(values, axis=1)).mean(axis=0)
-    seam = float(np.abs(values[:, 0] - values[:, -1]).mean())
-    poles = max(float(values[0].std()), float(values[-1].std()))
-    return seam <= float(columns.max()) and poles < POLE_SPREAD * float(values.std(axis=1).mean())
+    return Picture(width, height, found, several, colors, small, sphere, alpha, kind)

@@ -1,9 +1,8 @@
-"""The tags that structure from motion uses: camera, focal length and GPS position of EXIF, and XMP of panoramas."""
+"""The EXIF tags that structure from motion uses: camera, focal length and GPS position."""
 
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,8 +17,6 @@ FOCAL_LENGTH, FOCAL_LENGTH_35MM, LENS_MODEL = 0x920A, 0xA405, 0xA434
 
 MAX_TEXT = 200
 """Characters of a name that are read; EXIF allows megabytes."""
-
-_PROJECTION = re.compile(rb"GPano:ProjectionType\s*(?:=\s*[\"']|>)\s*(\w{1,40})")
 
 FULL_FRAME_DIAGONAL = math.hypot(36.0, 24.0)
 """Millimetres; the 35 mm equivalent focal length refers to this diagonal."""
@@ -74,13 +71,6 @@ def read(image: Image.Image) -> Exif:
         longitude=longitude,
         altitude=altitude,
     )
-
-
-def projection(image: Image.Image) -> str | None:
-    """The projection of an opened panorama by its XMP, as cameras and phones write it (GPano); None of other photos."""
-    xmp = image.info.get("xmp")
-    found = _PROJECTION.search(xmp if isinstance(xmp, bytes) else str(xmp or "").encode())
-    return None if found is None else found[1].decode()
 
 
 def _text(value: Any) -> str | None:

@@ -20,6 +20,9 @@ from splatmill_worker.scene import Camera, Lens
 
 Float = npt.NDArray[np.float64]
 
+PANORAMA = "EQUIRECTANGULAR"
+"""COLMAP's camera model of panoramas: columns are longitudes and rows latitudes, and z is in the middle."""
+
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE")
 """COLMAP's camera models without distortion."""
 
@@ -146,7 +149,7 @@ def sight(lens: Lens) -> float:
 def remarks(lenses: Iterable[Lens | None]) -> list[str]:
     """Warnings for the user about the photos with these lenses, where the undistorted ones do not show all that a lens
     sees, or show more; the figures are those of the most common lens."""
-    counts = Counter(lens for lens in lenses if lens is not None)
+    counts = Counter(lens for lens in lenses if lens is not None and lens.model != PANORAMA)
     said = []
     wide = Counter({lens: count for lens, count in counts.items() if _zoom_of(lens).cut})
     if wide:
@@ -184,7 +187,13 @@ def distortion(lens: Lens) -> float:
 
 
 def without_distortion(camera: pycolmap.Camera) -> Camera:
-    """The pinhole camera with the size, focal lengths and principal point of a COLMAP camera, at the origin."""
+    """The pinhole camera with the size, focal lengths and principal point of a COLMAP camera, at the origin.
+
+    Of a panorama, it is one that shows the middle as large; `faces` replaces it.
+    """
+    if camera.is_spherical():
+        focal, middle = camera.width / (2.0 * math.pi), (camera.width / 2.0, camera.height / 2.0)
+        return Camera(camera.width, camera.height, focal, focal, *middle, np.eye(4))
     return Camera(
         camera.width,
         camera.height,

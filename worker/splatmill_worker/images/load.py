@@ -16,7 +16,7 @@ import numpy.typing as npt
 import torch
 from PIL import Image
 
-from splatmill_worker.images import look_ups
+from splatmill_worker.images import decoded_panoramas, faces, look_ups
 from splatmill_worker.images.decode import Pixels
 from splatmill_worker.images.decoding.decoders import decode
 from splatmill_worker.images.masks import shown_part
@@ -88,6 +88,7 @@ def load_views(
             )
     finally:
         look_ups.forget()
+        decoded_panoramas.forget()
 
 
 class _Filed:
@@ -141,26 +142,30 @@ def load_view(
     """Load the photo of one view; arguments and errors are those of `load_views`."""
     full = view.camera
     width, height = training_size(full.width, full.height, longest_side)
-    # Undistortion interpolates a photo of at least twice the size, so that it does not blur.
-    enough = (width, height) if view.lens is None else (2 * width, 2 * height)
-    pixels = np.array(_decode_for(view, enough))
-    if pixels.ndim == 2:
-        pixels = np.repeat(pixels[:, :, None], 3, axis=2)
-    mask = None if view.mask is None else _read_mask(view, (pixels.shape[1], pixels.shape[0]))
-    has_alpha = pixels.shape[2] == 4
-    planes = torch.from_numpy(np.ascontiguousarray(pixels)).permute(2, 0, 1).float()
-    if mask is not None:
-        planes = torch.cat([planes, torch.from_numpy(mask).float()[None] * 255.0])
-    if has_alpha:
-        # Premultiplied, so that averages take no colour from transparent pixels.
-        planes[:3] *= planes[3:4] / 255.0
+    camera = full.scaled_to(width, height)
+    if view.face is not None:
+        size = faces.enough(camera)
+        key = view.image, view.mask, view.shown_from, view.upright, size
+        panorama = decoded_panoramas.of(
+            key, lambda: faces.prepared(_layers(view, size), view.mask is None, size)
+        )
+        planes = faces.resampled(panorama, view.face, camera)
+        has_alpha = len(planes) - (view.mask is not None) == 4
+    else:
+        # Undistortion interpolates a photo of at least twice the size, so that it does not blur.
+        layers = _layers(view, (width, height) if view.lens is None else (2 * width, 2 * height))
+        planes = torch.from_numpy(np.ascontiguousarray(layers)).permute(2, 0, 1).float()
+        has_alpha = len(planes) - (view.mask is not None) == 4
+        if has_alpha:
+            # Premultiplied, so that averages take no colour from transparent pixels.
+            planes[:3] *= planes[3:4] / 255.0
     keep = None
     if view.lens is None:
         planes = _area(planes, width, height)
     else:
         planes, seen = _undistort(planes, view.lens, full, width, height)
         keep = None if bool(seen.all()) else seen
-    if mask is not None:
+    if view.mask is not None:
         keep = planes[-1] >= MIN_COVER if keep is None else keep & (planes[-1] >= MIN_COVER)
     alpha = None
     rgb = planes[:3]
@@ -173,11 +178,22 @@ def load_view(
             rgb = rgb + (1.0 - cover) * 255.0 * torch.tensor(background, dtype=torch.float32)[:, None, None]
     return Photo(
         view,
-        full.scaled_to(width, height),
+        camera,
         np.ascontiguousarray(_bytes(rgb).transpose(1, 2, 0)),
         alpha,
         None if keep is None else keep.numpy(),
     )
+
+
+def _layers(view: View, enough: tuple[int, int]) -> Pixels:
+    """The photo at least as large as `enough`, [H,W,C], and its mask as the last channel, 255 where it shows."""
+    pixels = np.array(_decode_for(view, enough))
+    if pixels.ndim == 2:
+        pixels = np.repeat(pixels[:, :, None], 3, axis=2)
+    if view.mask is not None:
+        mask = _read_mask(view, (pixels.shape[1], pixels.shape[0]))
+        pixels = np.concatenate([pixels, np.uint8(255) * mask[:, :, None]], axis=2)
+    return pixels
 
 
 def _decode_for(view: View, enough: tuple[int, int]) -> Image.Image:
@@ -190,7 +206,7 @@ def _decode_for(view: View, enough: tuple[int, int]) -> Image.Image:
 def _check_shape(view: View, path: Path, size: tuple[int, int]) -> None:
     """Raise ValueError for a photo or mask whose aspect ratio differs from the camera's by more than rounding."""
     width, height = size
-    expected = view.camera.width / view.camera.height
+    expected = view.camera.width / view.camera.height if view.face is None else 2.0
     # Reduced sizes are rounded to whole pixels, which changes the aspect ratio of small photos the most.
     if abs(width / height / expected - 1.0) > 0.02 + 2.0 / min(width, height):
         raise ValueError(

@@ -20,7 +20,16 @@ from splatmill.schema.files.outputs import own_outputs
 from splatmill.schema.files.photos import ARCHIVE_SUFFIXES, VIDEO_SUFFIXES, unread, unread_kind
 from splatmill.schema.quantities import counted
 from splatmill_worker.errors import Cancelled, CaptureIncomplete, UnusablePicture, UnusableVideo
-from splatmill_worker.images import copies, exif, mask_levels, no_photo, overlays, photo_colors, transparency
+from splatmill_worker.images import (
+    copies,
+    exif,
+    mask_levels,
+    no_photo,
+    overlays,
+    panoramas,
+    photo_colors,
+    transparency,
+)
 from splatmill_worker.images.archives import archive, unpacked_room
 from splatmill_worker.images.copies import SmallPicture
 from splatmill_worker.images.decoding import decoders
@@ -36,12 +45,6 @@ IGNORED_NAMES = ("thumbs.db", "desktop.ini")
 
 MACHINE_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
 """Errors of the operating system that say nothing about the file: they end the attempt."""
-
-CUT_PANORAMAS = (
-    "Cut panoramas into pinhole photos of 90 degrees, the faces of a cube, and give these: COLMAP's example "
-    "panorama_sfm.py does so, and ns-process-data of nerfstudio with --camera-type equirectangular."
-)
-"""What to do about panoramas."""
 
 DEFAULT_FRAMES = 100
 """Frames taken from a video."""
@@ -61,7 +64,8 @@ class UsablePhoto:
     sequence: name of the video that the photo is a frame of, if it is one.
     several: whether the file holds further pictures, which are not used.
     colors: how its colours become sRGB, as `PhotoColors.remark` says it.
-    closed: whether it has the shape and the edges of a panorama of 360 by 180 degrees.
+    sphere: what says that it is a panorama.
+    is_panorama: whether it is taken for one, which shows 360 by 180 degrees.
     alpha: its smallest and largest alpha.
     kind: what it seems to be, if no photo.
     """
@@ -77,7 +81,8 @@ class UsablePhoto:
     sequence: str | None = None
     several: bool = False
     colors: str = ""
-    closed: bool = False
+    sphere: panoramas.Sphere = ""
+    is_panorama: bool = False
     alpha: transparency.Extent = (255, 255)
     kind: no_photo.Kind = ""
 
@@ -105,7 +110,8 @@ class Prepared:
         digest = hashlib.sha256()
         for photo in self.photos:
             mask = f"{_sha256(photo.mask)}{photo.shown_from}" if photo.mask is not None else ""
-            digest.update(f"{photo.name}\0{photo.sha256}\0{mask}\n".encode())
+            kind = "\0panorama" if photo.is_panorama else ""
+            digest.update(f"{photo.name}\0{photo.sha256}\0{mask}{kind}\n".encode())
         return digest.hexdigest()
 
 
@@ -222,20 +228,24 @@ def prepare(
         raise CaptureIncomplete(f"{images.name}/", lost, len(given))
     unused = mask_files.keys() - pairs.values()
     judged = mask_levels.judged({photo.name: photo.mask for photo in ordered}, unused)
-    ordered = [replace(photo, shown_from=judged.shown_from) for photo in ordered]
+    are_panoramas, assumed = panoramas.decided(
+        [
+            panoramas.Candidate(
+                each.name, each.width, each.height, _source(each), each.sequence is not None, each.sphere
+            )
+            for each in ordered
+        ]
+    )
+    found.warnings += assumed
+    ordered = [
+        replace(photo, shown_from=judged.shown_from, is_panorama=is_panorama)
+        for photo, is_panorama in zip(ordered, are_panoramas, strict=True)
+    ]
     found.warnings += photo_colors.sentences([photo.colors for photo in ordered])
     skipped = [name for name, _ in found.skipped]
     warnings = [*judged.warnings, *unfit(found.unfit_masks), *unread(skipped), *unread_cameras(skipped)]
     hidden = overlays.hidden_in(
-        [
-            overlays.Candidate(
-                each.name,
-                each.width,
-                each.height,
-                each.sequence or PurePosixPath(each.name).parent.as_posix(),
-            )
-            for each in ordered
-        ],
+        [overlays.Candidate(each.name, each.width, each.height, _source(each)) for each in ordered],
         lambda index, size: _picture(ordered[index], small, size),
     )
     ordered = [
@@ -250,7 +260,6 @@ def prepare(
     ]
     found.warnings += [*copies.warning(copied), *hidden.warnings]
     found.warnings += transparency.remarks({photo.name: photo.alpha for photo in ordered})
-    found.warnings += _panoramas([photo.name for photo in ordered if photo.closed])
     return Prepared(
         tuple(ordered),
         tuple(found.skipped),
@@ -260,15 +269,9 @@ def prepare(
     )
 
 
-def _panoramas(names: list[str]) -> list[str]:
-    """A warning about photos that look like panoramas; none where there are none."""
-    if not names:
-        return []
-    are = counted(len(names), "photo is", "photos are")
-    return [
-        f"{are} twice as wide as high with edges that meet, as those of 360-degree panoramas do (such as {names[0]}). "
-        f"They are taken for photos of a pinhole camera, which is wrong for panoramas. {CUT_PANORAMAS}"
-    ]
+def _source(photo: UsablePhoto) -> str:
+    """The video or folder that a photo is from."""
+    return photo.sequence or PurePosixPath(photo.name).parent.as_posix()
 
 
 def given_files(images: Path) -> list[Path]:
@@ -441,8 +444,6 @@ def _inspect(name: str, path: Path, sequence: str | None) -> tuple[UsablePhoto, 
         return f"it cannot be read: {error.strerror}"
     if isinstance(found, str):
         return found
-    if found.projection is not None:
-        return f"it is a panorama ({found.projection} by its XMP), which no pinhole camera shows. {CUT_PANORAMAS}"
     if transparency.is_clear(found.alpha):
         return transparency.NOTHING
     photo = UsablePhoto(
@@ -455,7 +456,7 @@ def _inspect(name: str, path: Path, sequence: str | None) -> tuple[UsablePhoto, 
         sequence=sequence,
         several=found.several,
         colors=found.colors,
-        closed=found.closed,
+        sphere=found.sphere,
         alpha=found.alpha,
         kind=found.kind,
     )

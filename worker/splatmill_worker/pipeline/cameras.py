@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from splatmill.schema import LogEvent
+from splatmill_worker.images import faces
 from splatmill_worker.pipeline.capture import posed_scene
 from splatmill_worker.pipeline.events import progress_events
 from splatmill_worker.pipeline.holdout import honest_split
@@ -43,7 +44,11 @@ def recover_cameras(job: Job, stages: Stages) -> Cameras:
         )
     if job.looks is not None and job.looks.seconds:
         stages.add("sfm", -job.looks.seconds)
-    parts = honest_split(scene, job.options)
+    parts = honest_split(faces.joined(scene), job.options)
+    training, held_out = (
+        tuple(face for view in views for face in faces.faces_of(view))
+        for views in (parts.training, parts.held_out)
+    )
     scene = replace(
         scene,
         left_out=(*scene.left_out, *parts.left_out),
@@ -57,6 +62,6 @@ def recover_cameras(job: Job, stages: Stages) -> Cameras:
         job.emit(LogEvent(level="warning", message=sentence, about="unused_photos"))
     normalization = Normalization.of(scene)
     world = ExportWorld.of(normalization, scene)
-    placement = placement_of(scene, world, (view.name for view in parts.held_out))
+    placement = placement_of(scene, world, (view.name for view in held_out))
     store_placement(placement, job.workdir, job.emit)
-    return Cameras(scene, normalization, normalization.apply(scene), parts.training, parts.held_out, world)
+    return Cameras(scene, normalization, normalization.apply(scene), training, held_out, world)

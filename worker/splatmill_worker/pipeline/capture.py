@@ -10,7 +10,7 @@ from splatmill.data_sets import TwoDataSets
 from splatmill.schema import TrainOptions, known_distance
 from splatmill_worker import sfm
 from splatmill_worker.errors import Refusal
-from splatmill_worker.images import overlays
+from splatmill_worker.images import faces, overlays
 from splatmill_worker.images.masks import mask_folder
 from splatmill_worker.images.prepare import names_remark
 from splatmill_worker.pipeline import example, given_points, one_place
@@ -65,7 +65,7 @@ def posed_scene(
                 advice="Leave out the option scale, or scale the given cameras.",
             )
         try:
-            scene = overlays.in_views(given.load(), workdir)
+            scene = faces.cut(overlays.in_views(given.load(), workdir))
         except posed.UnreadModel as error:
             raise Refusal("poses_invalid", str(error), advice=error.advice) from error
         except (ValueError, OSError) as error:

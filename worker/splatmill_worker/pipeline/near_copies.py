@@ -2,7 +2,8 @@
 
 What makes a held-out photo a test is that it was taken from another place. So two photos are near copies when the scene
 hardly shifts between their places, apart from how the camera was turned, and one shows most of what the other shows.
-Photos are copies when their content is the same (`images.copies`); from one place, less of it suffices.
+Photos are copies when their content is the same (`images.copies`); from one place, less of it suffices. A panorama
+shows all directions; its shift is measured as an angle, of which a radian stands for the longer side of a photo.
 """
 
 from __future__ import annotations
@@ -10,9 +11,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
+import numpy.typing as npt
 
 from splatmill_worker.images.copies import SMALL_SIDE, SmallPicture, is_copy, small_grey
 from splatmill_worker.images.decoding import decoders
+from splatmill_worker.images.faces import faces_of, is_panorama
 from splatmill_worker.scene import Float, Scene, View, looked_at
 
 PARALLAX = 0.003
@@ -106,8 +109,9 @@ def _pairs(
     def shown(view: View) -> Float:
         points = observed[view.name]
         if len(points) < LEAST_POINTS:
-            points = _plane(view, float(np.linalg.norm(target - view.camera.center)))
-        return points[view.camera.project(points).inside]
+            distance = float(np.linalg.norm(target - view.camera.center))
+            points = np.concatenate([_plane(part, distance) for part in faces_of(view)])
+        return points[_inside(view, points)]
 
     points_of = {view.name: shown(view) for view in {id(view): view for view in (*views, *others)}.values()}
     for view in views:
@@ -115,24 +119,36 @@ def _pairs(
         points = points_of[view.name]
         if not len(points):
             continue
-        depth = float(np.median(camera.project(points).depths))
-        reach = NEARBY * most * max(camera.width, camera.height) / camera.fx * depth
+        if is_panorama(view):
+            reach = NEARBY * most * float(np.median(np.linalg.norm(points - camera.center, axis=1)))
+        else:
+            depth = float(np.median(camera.project(points).depths))
+            reach = NEARBY * most * max(camera.width, camera.height) / camera.fx * depth
         for index in np.flatnonzero(np.linalg.norm(centers - camera.center, axis=1) <= reach).tolist():
             other = others[index]
             if other is view or not (shift := _shift(view, other, points)) <= most:
                 continue
             both = ((other, points), (view, points_of[other.name]))
-            if any(len(seen) and each.camera.project(seen).inside.mean() >= OVERLAP for each, seen in both):
+            if any(len(seen) and _inside(each, seen).mean() >= OVERLAP for each, seen in both):
                 yield view, other, shift
 
 
 def _shift(view: View, other: View, points: Float) -> float:
     """The median shift of points of one photo from its place to that of the other, as a share of the longer side."""
     camera = view.camera
+    if is_panorama(view):
+        rays, moved = (points - each.camera.center for each in (view, other))
+        across = np.linalg.norm(np.cross(rays, moved), axis=1)
+        return float(np.median(np.arctan2(across, (rays * moved).sum(axis=1))))
     here, there = camera.project(points), camera.moved_to(other.camera.center).project(points)
     shift = np.hypot(there.columns - here.columns, there.rows - here.rows) / max(camera.width, camera.height)
     shift[np.isnan(shift)] = np.inf  # behind the other place
     return float(np.median(shift))
+
+
+def _inside(view: View, points: Float) -> npt.NDArray[np.bool_]:
+    """Whether a photo shows each of some points [n]."""
+    return np.ones(len(points), bool) if is_panorama(view) else view.camera.project(points).inside
 
 
 def _observed(scene: Scene) -> dict[str, Float]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from splatmill_worker.images.faces import photos_of
 from splatmill_worker.scene import Scene
 
 LEAST_BASELINE = 0.05
@@ -33,7 +34,7 @@ def warning(scene: Scene) -> list[str]:
         return []
     share = f", {baseline / depth:.1%} of the distance of what they show" if depth else ""
     return [
-        f"All {len(centers)} photos were taken from nearly one place{share}. They do not show how far anything is: "
-        "views from other places will be wrong, and a high PSNR says nothing of them. Move sideways between photos, "
-        "rather than turn in place."
+        f"All {photos_of(scene.views)} photos were taken from nearly one place{share}. They do not show how far "
+        "anything is: views from other places will be wrong, and a high PSNR says nothing of them. Move sideways "
+        "between photos, rather than turn in place."
     ]

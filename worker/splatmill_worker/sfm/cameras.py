@@ -29,6 +29,7 @@ class CameraGroup:
     width, height: their size in pixels.
     focal: initial focal length, over the longest side.
     known: whether EXIF gave the focal length.
+    is_panorama: whether it shows 360 by 180 degrees, which has no focal length.
     """
 
     photos: tuple[int, ...]
@@ -36,6 +37,7 @@ class CameraGroup:
     height: int
     focal: float
     known: bool
+    is_panorama: bool = False
 
 
 def group(photos: Sequence[UsablePhoto]) -> list[CameraGroup]:
@@ -56,6 +58,8 @@ def group(photos: Sequence[UsablePhoto]) -> list[CameraGroup]:
 
 def _key(photo: UsablePhoto) -> tuple[object, ...]:
     """What photos of one camera agree in; last, the video or folder of a photo without EXIF of its camera."""
+    if photo.is_panorama:
+        return photo.width, photo.height, "panorama"
     tags = photo.exif
     camera = (tags.make, tags.model, tags.lens, tags.focal_length, tags.focal_in_diagonals)
     source = photo.sequence or PurePosixPath(photo.name).parent if camera == (None,) * len(camera) else None
@@ -63,6 +67,8 @@ def _key(photo: UsablePhoto) -> tuple[object, ...]:
 
 
 def _group(members: tuple[int, ...], photo: UsablePhoto) -> CameraGroup:
+    if photo.is_panorama:
+        return CameraGroup(members, photo.width, photo.height, 1.0 / (2.0 * math.pi), True, is_panorama=True)
     focal = _focal(photo)
     known = focal is not None and FOCAL_BOUNDS[0] <= focal <= FOCAL_BOUNDS[1]
     return CameraGroup(

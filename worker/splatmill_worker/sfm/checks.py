@@ -70,6 +70,8 @@ def min_registered(count: int) -> int:
 def implausible_intrinsics(model: pycolmap.Reconstruction) -> str | None:
     """A phrase for the first camera whose intrinsics no lens has; None when all are plausible."""
     for camera in model.cameras.values():
+        if camera.is_spherical():
+            continue
         focal = camera.mean_focal_length() / max(camera.width, camera.height)
         if not FOCAL_BOUNDS[0] <= focal <= FOCAL_BOUNDS[1]:
             return f"a focal length of {focal:.2f} times the photo's longest side"
@@ -93,8 +95,12 @@ def reprojection_errors(model: pycolmap.Reconstruction) -> dict[int, tuple[int, 
             result[image_id] = 0, math.inf
             continue
         world = np.array([points[point.point3D_id] for point in observed])
-        projected = np.asarray(model.cameras[image.camera_id].img_from_cam(image.cam_from_world() * world))
-        error = np.linalg.norm(projected - np.array([point.xy for point in observed]), axis=1)
+        camera = model.cameras[image.camera_id]
+        projected = np.asarray(camera.img_from_cam(image.cam_from_world() * world))
+        off = projected - np.array([point.xy for point in observed])
+        if camera.is_spherical():  # whose left and right borders meet
+            off[:, 0] -= camera.width * np.round(off[:, 0] / camera.width)
+        error = np.linalg.norm(off, axis=1)
         result[image_id] = len(observed), float(np.mean(error)) if np.isfinite(error).all() else math.inf
     return result
 

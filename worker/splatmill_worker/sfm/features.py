@@ -18,13 +18,14 @@ from PIL import Image
 from splatmill.files import replacing
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.images.decoding.decoders import decode
+from splatmill_worker.images.lens import PANORAMA
 from splatmill_worker.images.load import training_size
 from splatmill_worker.images.masks import shown_part
 from splatmill_worker.images.prepare import UsablePhoto
 from splatmill_worker.scene import MIN_SHOWN
 from splatmill_worker.sfm.callbacks import OnProgress, stop_if, watched
 from splatmill_worker.sfm.cameras import CameraGroup
-from splatmill_worker.sfm.options import Effort
+from splatmill_worker.sfm.options import PANORAMA_FEATURES, PANORAMA_SIDE, Effort
 
 MAX_IMAGES = 2147483647
 """COLMAP's kMaxNumImages: it numbers the pair of images a < b as MAX_IMAGES * a + b."""
@@ -100,14 +101,12 @@ def extract(
     extracted = _extracted(store.database)
     done = len(extracted)
     reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = camera_model
     if any(photo.mask is not None for photo in photos):
         store.masks.mkdir(parents=True, exist_ok=True)
         reader.mask_path = store.masks
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False
     options.num_threads = threads
-    options.sift.max_num_features = effort.features
     options.sift.first_octave = effort.first_octave
     options.sift.max_num_orientations = effort.orientations
     store.images.mkdir(parents=True, exist_ok=True)
@@ -115,11 +114,18 @@ def extract(
     with ThreadPoolExecutor(threads) as pool:
         for group in groups:
             missing = [index for index in group.photos if names[index] not in extracted]
+            reader.camera_model = PANORAMA if group.is_panorama else camera_model
+            options.sift.max_num_features = effort.features * (PANORAMA_FEATURES if group.is_panorama else 1)
+            side = round(effort.side * (PANORAMA_SIDE if group.is_panorama else 1.0))
             while missing:
                 batch, missing = missing[:size], missing[size:]
                 stop_if(cancelled)
                 started = time.monotonic()
-                list(pool.map(lambda index: _reduce(photos[index], effort.side, store, names[index]), batch))
+                list(
+                    pool.map(
+                        lambda index, side=side: _reduce(photos[index], side, store, names[index]), batch
+                    )
+                )
                 # COLMAP would otherwise create a new camera for each batch.
                 reader.existing_camera_id = _camera_of(group, names, store.database)
                 files = [names[index] for index in batch]
@@ -250,6 +256,8 @@ def _set_cameras(groups: Sequence[CameraGroup], names: dict[int, str], path: Pat
     database = pycolmap.Database.open(path)
     try:
         for group in groups:
+            if group.is_panorama:
+                continue
             image = database.read_image_with_name(names[group.photos[0]])
             if image is None:
                 continue  # COLMAP could not read the reduced photo; `solve_at` checks that all were read

@@ -119,7 +119,11 @@ def _adjusted(
     initial = {
         camera_id: group.focal * max(model.cameras[camera_id].width, model.cameras[camera_id].height)
         for camera_id, group in groups.items()
+        if not group.is_panorama
     }
+    if not initial:
+        adjust.bundle_adjust(model, run.threads, cancelled=run.cancelled, on_iterations=report)
+        return model, ()
     adjusted = adjust.adjust_with_lenses(model, initial, run.threads, run.cancelled, report)
     if adjusted.tied:
         run.notes.append(

@@ -73,7 +73,7 @@ def focal_steps(model: pycolmap.Reconstruction) -> dict[int, float]:
     for image_id in model.reg_image_ids():
         image = model.images[image_id]
         observed = image.get_observation_points2D()
-        if len(observed) < RELIABLE_OBSERVED:
+        if len(observed) < RELIABLE_OBSERVED or model.cameras[image.camera_id].is_spherical():
             continue
         local = image.cam_from_world() * np.array([points[point.point3D_id] for point in observed])
         pixels = np.array([point.xy for point in observed])

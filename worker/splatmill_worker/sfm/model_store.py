@@ -10,6 +10,7 @@ from typing import Any
 
 from splatmill.schema import KnownDistance, ModelFrame
 from splatmill_worker.colmap import pycolmap, write_model
+from splatmill_worker.images import faces
 from splatmill_worker.images.lens import remarks
 from splatmill_worker.images.prepare import Prepared
 from splatmill_worker.scene import Scene, View
@@ -47,7 +48,7 @@ def store_model(run: SfmRun, final: FinalModel, folder: Path) -> None:
     if run.options.stereo and stereo.has_few_points(scene):
         # Photos are swept one after the other, so that each torch call gets all threads.
         with run.clock("stereo"), torch_threads(run.threads):
-            stereo.with_stereo_points(scene, partial / STEREO, run.on_progress, run.cancelled)
+            stereo.with_stereo_points(faces.cut(scene), partial / STEREO, run.on_progress, run.cancelled)
     tags = {photo.name: photo.exif for photo in run.prepared.photos}
     frame = choose(scene, [tags[view.name] for view in scene.views])
     (partial / FRAME).write_text(frame.model_dump_json(indent=1), "utf-8")
@@ -85,6 +86,7 @@ def load_model(prepared: Prepared, folder: Path, known: KnownDistance | None = N
         warnings=(*prepared.warnings, *document["warnings"], *remarks(view.lens for view in scene.views)),
         overlays=prepared.overlays,
     )
+    scene = faces.cut(scene)
     if (folder / STEREO).is_file():
         scene = stereo.add(scene, stereo.StereoPoints.load(folder / STEREO))
     return in_frame(scene, ModelFrame.model_validate_json((folder / FRAME).read_bytes()), known)

@@ -66,6 +66,13 @@ EFFORTS = {effort.name: effort for effort in (LEAN, STANDARD, HIGH)}
 NEXT_EFFORT = 3.0
 """Time of an effort over that of all before it: STANDARD's features take four times those of LEAN, and mapping less."""
 
+PANORAMA_SIDE = 3.0
+"""Longest side of a panorama that features are found on, over that of other photos: its pixels are then of the size of
+those of a photo that shows 120 degrees across."""
+
+PANORAMA_FEATURES = 4
+"""Features of a panorama, over those of other photos: it shows as much as several of them."""
+
 SMALL_SIDE = 700
 """Longest side, in pixels, up to which SIFT doubles the size of photos at any effort: small photos have few features,
 and doubling them takes little time."""

@@ -28,6 +28,7 @@ from splatmill_worker.sfm.options import (
     HIGH,
     LEAN,
     NEXT_EFFORT,
+    PANORAMA_SIDE,
     STANDARD,
     Effort,
     SfmOptions,
@@ -166,7 +167,14 @@ def _solve(run: SfmRun) -> EffortResult:
     """The best result of the efforts that were needed."""
     best: EffortResult | None = None
     best_counts = 0, 0
-    longest = int(np.median([max(photo.width, photo.height) for photo in run.prepared.photos]))
+    longest = int(
+        np.median(
+            [
+                max(photo.width, photo.height) / (PANORAMA_SIDE if photo.is_panorama else 1.0)
+                for photo in run.prepared.photos
+            ]
+        )
+    )
     for effort in _efforts(run.options, longest):
         if best is not None:
             if 2 * best_counts[0] >= run.count and not run.has_time_for(NEXT_EFFORT):

@@ -71,7 +71,12 @@ def unfold(run: SfmRun, result: EffortResult) -> None:
     `result.mapped` and `result.left_out` are changed where that leaves fewer contradictions and enough photos; a note
     says what was found either way. Raises Cancelled.
     """
-    if result.mapped is None or result.mapped.largest is None:
+    # Panoramas show the surroundings, which differ where a thing looks alike from two sides.
+    if (
+        result.mapped is None
+        or result.mapped.largest is None
+        or any(group.is_panorama for group in run.groups)
+    ):
         return
     database = pycolmap.Database.open(result.store.database)
     try:

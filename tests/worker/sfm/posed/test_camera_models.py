@@ -1,7 +1,7 @@
-"""Proves which camera models are read, in transforms.json and in COLMAP models; that others are refused by name, with
-what is read and what to do; and the warning about panoramas without cameras.
+"""Proves which camera models are read, in transforms.json and in COLMAP models; and that others are refused by name,
+with what is read and what to do.
 
-Does not prove how lenses are undistorted: tests/worker/images/test_lens.py does.
+Does not prove how lenses are undistorted: tests/worker/images/test_lens.py does, and test_faces.py for panoramas.
 """
 
 import json
@@ -11,14 +11,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from splatmill.schema import TrainOptions
-from splatmill_worker.errors import Refusal, SfmFailed
-from splatmill_worker.images.prepare import prepare
+from splatmill_worker.errors import Refusal
+from splatmill_worker.images import faces
 from splatmill_worker.pipeline.capture import posed_scene
 from splatmill_worker.scene import Lens, Scene
-from splatmill_worker.sfm import SfmOptions, reconstruct
 from splatmill_worker.sfm.posed import camera_models
 from tests.support import posed_sets
 from tests.support.posed_sets import COUNT, NAMES, frames, loaded
@@ -48,12 +46,10 @@ def lens_of(scene: Scene) -> Lens | None:
 @pytest.mark.parametrize(
     ("values", "name"),
     [
-        ({"camera_model": "EQUIRECTANGULAR"}, "EQUIRECTANGULAR"),
-        ({"camera_model": "equirectangular"}, "equirectangular"),
         ({"camera_model": "VR180_L"}, "VR180_L"),
         ({"camera_model": "OMNIDIRECTIONALSTEREO_R"}, "OMNIDIRECTIONALSTEREO_R"),
         ({"latlong": True}, "LATLONG"),
-        ({"equirectangular": True}, "EQUIRECTANGULAR"),
+        ({"equirectangular": True}, "EQUIRECTANGULAR_EQUAL_AREA"),
         ({"camera_model": "ORTHOPHOTO"}, "ORTHOPHOTO"),
         ({"camera_model": "FISHEYE624"}, "FISHEYE624"),
         ({"camera_model": "THIN_PRISM_FISHEYE"}, "THIN_PRISM_FISHEYE"),
@@ -76,11 +72,11 @@ def test_models_that_are_not_read_are_refused_by_name(
 
 
 def test_one_frame_of_a_model_that_is_not_read_is_left_out(tmp_path: Path) -> None:
-    scene = loaded(transforms(tmp_path, {3: {"camera_model": "EQUIRECTANGULAR"}}))
+    scene = loaded(transforms(tmp_path, {3: {"camera_model": "CYLINDRICAL"}}))
     assert len(scene.views) == COUNT - 1
     ((name, why),) = scene.left_out
     assert name == NAMES[3]
-    assert "the camera model is EQUIRECTANGULAR" in why
+    assert "the camera model is CYLINDRICAL" in why
 
 
 @pytest.mark.parametrize(
@@ -111,79 +107,55 @@ def test_models_that_are_read(
     assert (() if own is None else own.params[4:]) == extra
 
 
-@pytest.mark.parametrize("form", ["text", "binary"])
-@pytest.mark.parametrize("name", ["EQUIRECTANGULAR", "POLAROID"])
-def test_colmap_models_that_are_not_read_are_refused_by_name(tmp_path: Path, form: str, name: str) -> None:
-    capture = tmp_path / "capture"
-    posed_sets.photos(capture / "images")
+def colmap(capture: Path, form: str, name: str, number: int, size: tuple[int, int]) -> Path:
+    """A data set with a COLMAP model of a camera with two parameters, the sides of the photo."""
+    posed_sets.photos(capture / "images", size=size)
     folder = capture / "sparse/0"
     posed_sets.model(folder)
     if form == "text":
-        (folder / "cameras.txt").write_text(f"1 {name} 64 48 64 48\n")
-    else:
-        for stem in ("cameras", "images", "points3D"):
-            (folder / f"{stem}.txt").unlink()
-        number = {"EQUIRECTANGULAR": 17, "POLAROID": 99}[name]
-        (folder / "cameras.bin").write_bytes(struct.pack("<QIiQQ2d", 1, 1, number, 64, 48, 64.0, 48.0))
-        image = (
-            struct.pack("<I7dI", 1, 1, 0, 0, 0, 0, 0, 0, 1) + NAMES[0].encode() + b"\0" + struct.pack("<Q", 0)
-        )
-        (folder / "images.bin").write_bytes(struct.pack("<Q", 1) + image)
-    error = refused(capture, tmp_path)
+        (folder / "cameras.txt").write_text(f"1 {name} {size[0]} {size[1]} {size[0]} {size[1]}\n")
+        return capture
+    for stem in ("cameras", "images", "points3D"):
+        (folder / f"{stem}.txt").unlink()
+    (folder / "cameras.bin").write_bytes(struct.pack("<QIiQQ2d", 1, 1, number, *size, *map(float, size)))
+    image = struct.pack("<I7dI", 1, 1, 0, 0, 0, 0, 0, 0, 1) + NAMES[0].encode() + b"\0" + struct.pack("<Q", 0)
+    (folder / "images.bin").write_bytes(struct.pack("<Q", 1) + image)
+    return capture
+
+
+@pytest.mark.parametrize(("form", "name"), [("text", "POLAROID"), ("binary", "99")])
+def test_colmap_models_that_are_not_read_are_refused_by_name(tmp_path: Path, form: str, name: str) -> None:
+    error = refused(colmap(tmp_path / "capture", form, name, 99, (64, 48)), tmp_path)
     assert "THIN_PRISM_FISHEYE" in error.message  # one of those that are read
-    assert (name if form == "text" or name == "EQUIRECTANGULAR" else "99") in error.message
+    assert name in error.message
     assert error.advice is not None
-    assert ("faces of a cube" in error.advice) == (name == "EQUIRECTANGULAR")
 
 
-def panorama(path: Path, xmp: str | None = None, seed: int = 0) -> None:
-    """A sphere with stripes, 512 x 256 pixels."""
-    longitude, latitude = np.meshgrid(
-        (np.arange(512) + 0.5) / 512 * 2 * np.pi, (0.5 - (np.arange(256) + 0.5) / 256) * np.pi
-    )
-    x, y, z = np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)
-    grey = 128 + 50 * np.sin(9 * x + seed) + 50 * np.sin(7 * y + 5 * z)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    options: dict[str, Any] = {} if xmp is None else {"xmp": xmp.encode()}
-    Image.fromarray(grey.astype(np.uint8)).convert("RGB").save(path, quality=95, **options)
+@pytest.mark.parametrize("form", ["text", "binary"])
+def test_panoramas_of_colmap_models_are_read(tmp_path: Path, form: str) -> None:
+    scene = loaded(colmap(tmp_path, form, "EQUIRECTANGULAR", 17, (64, 32)))
+    assert lens_of(scene) == Lens("EQUIRECTANGULAR", (64.0, 32.0), 64, 32)
 
 
-GPANO = (
-    '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF><rdf:Description '
-    'xmlns:GPano="http://ns.google.com/photos/1.0/panorama/" {}/></rdf:RDF></x:xmpmeta>'
-)
+@pytest.mark.parametrize("name", ["EQUIRECTANGULAR", "equirectangular"])
+def test_panoramas_of_transforms_are_read_and_keep_their_pose(tmp_path: Path, name: str) -> None:
+    capture = transforms(tmp_path, camera_model=name, w=64, h=32)
+    posed_sets.photos(capture / "images", size=(64, 32))
+    scene = faces.cut(loaded(capture))
+    assert len(scene.views) == 6 * COUNT
+    fronts = [view for view in scene.views if view.name.endswith("/front")]
+    for number, view in enumerate(fronts):
+        np.testing.assert_allclose(view.camera.viewmat, posed_sets.viewmat(number), atol=1e-12)
+    assert [view.photo for view in fronts] == NAMES
 
 
-@pytest.mark.parametrize(
-    "field",
-    [
-        'GPano:ProjectionType="equirectangular"',
-        "><GPano:ProjectionType>equirectangular</GPano:ProjectionType",
-    ],
-)
-def test_panoramas_by_their_xmp_are_left_out_and_said(tmp_path: Path, field: str) -> None:
-    for number in range(3):
-        panorama(tmp_path / "images" / f"{number}.jpg", GPANO.format(field), number)
-    with pytest.raises(SfmFailed, match="it is a panorama \\(equirectangular by its XMP\\)") as error:
-        reconstruct(
-            tmp_path / "images", None, tmp_path / "work", SfmOptions(), lambda *_: None, lambda: False
-        )
-    assert error.value.code == "no_images"
-    Image.new("RGB", (512, 256), (9, 99, 99)).save(tmp_path / "images" / "plain.jpg")
-    prepared = prepare(tmp_path / "images", None, tmp_path / "work")
-    assert [photo.name for photo in prepared.photos] == ["plain.jpg"]
-    assert all("faces of a cube" in why for _, why in prepared.skipped)
-
-
-def test_pictures_with_the_edges_of_a_panorama_are_questioned(tmp_path: Path) -> None:
-    for number in range(2):
-        panorama(tmp_path / "images" / f"{number}.jpg", None, number)
-    random = np.random.default_rng(0)
-    for number in range(2):  # as wide, but a photo
-        pixels = random.integers(0, 256, (16, 32, 3), np.uint8)
-        Image.fromarray(pixels).resize((512, 256)).save(tmp_path / "images" / f"photo{number}.jpg")
-    prepared = prepare(tmp_path / "images", None, tmp_path / "work")
-    assert len(prepared.photos) == 4
-    (warning,) = prepared.warnings
-    assert warning.startswith("2 photos are twice as wide as high with edges that meet")
-    assert "(such as 0.jpg)" in warning
+def test_panoramas_that_are_not_twice_as_wide_as_high_are_refused(tmp_path: Path) -> None:
+    """Both readings are named: a part of a panorama, and another lens."""
+    for capture in (
+        transforms(tmp_path / "a", camera_model="EQUIRECTANGULAR"),
+        colmap(tmp_path / "b", "text", "EQUIRECTANGULAR", 17, (64, 48)),
+    ):
+        message = refused(capture, tmp_path).message
+        assert "EQUIRECTANGULAR, and the photo has 64 x 48 pixels" in message
+        assert "part of a panorama" in message
+        assert "another lens" in message

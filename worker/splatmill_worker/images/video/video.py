@@ -78,7 +78,7 @@ def keyframes(
     with _decoded(path, cancelled) as (aspect, frames):
         for number, frame in frames:
             if number == numbers[done]:
-                picture = _jpeg(video_frame.picture(frame, aspect))
+                picture = _jpeg(video_frame.picture(frame, aspect), video_frame.panorama_xmp(frame))
                 size += len(picture)
                 if size > MAX_WRITTEN_BYTES:
                     raise UnusableVideo(
@@ -102,9 +102,9 @@ def remarks(path: Path) -> list[str]:
     return []
 
 
-def _jpeg(image: Image.Image) -> bytes:
+def _jpeg(image: Image.Image, xmp: bytes) -> bytes:
     picture = io.BytesIO()
-    image.save(picture, "JPEG", quality=QUALITY, subsampling=0)
+    image.save(picture, "JPEG", quality=QUALITY, subsampling=0, xmp=xmp)
     return picture.getvalue()
 
 

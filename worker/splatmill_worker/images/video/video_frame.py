@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import sys
 from fractions import Fraction
 from typing import Any
 
@@ -35,6 +36,16 @@ TURNS: dict[tuple[float, ...], Image.Transpose | None] = {
     (0, -1, -1, 0): Image.Transpose.TRANSVERSE,
 }
 """What makes a frame upright, by the signs of its display matrix: a, b, c, d of (x, y) -> (a x + c y, b x + d y)."""
+
+SPHERICAL = {0: "equirectangular", 1: "cubemap", 2: "equirectangular_tile", 3: "half_equirectangular"}
+"""FFmpeg's projections of panoramas (AVSphericalProjection), and names for them."""
+
+XMP = (
+    '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+    '<rdf:Description xmlns:GPano="http://ns.google.com/photos/1.0/panorama/" GPano:ProjectionType="{}"/>'
+    "</rdf:RDF></x:xmpmeta>"
+)
+"""By which a frame is a panorama for those that read it as a photo (`images.panoramas`)."""
 
 Pixels = npt.NDArray[np.uint8]
 
@@ -90,6 +101,13 @@ def picture(frame: av.VideoFrame, aspect: Fraction | None) -> Image.Image:
         image = image.resize(size, Image.Resampling.LANCZOS)
     turn = TURNS.get(_signs(frame))
     return image if turn is None else image.transpose(turn)
+
+
+def panorama_xmp(frame: av.VideoFrame) -> bytes:
+    """The XMP of a frame that is a panorama by the spherical metadata of its video; empty for any other."""
+    mapping: Any = frame.side_data.get("SPHERICAL")
+    projection = None if mapping is None else SPHERICAL.get(int.from_bytes(bytes(mapping)[:4], sys.byteorder))
+    return b"" if projection is None else XMP.format(projection).encode()
 
 
 def _signs(frame: av.VideoFrame) -> tuple[float, ...]:

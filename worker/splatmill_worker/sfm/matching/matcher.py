@@ -6,7 +6,7 @@ one matrix product in torch's BLAS (decisions: EXHAUSTIVE_MATCHING).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -34,14 +34,25 @@ Matches = npt.NDArray[np.uint32]
 class Matcher:
     """Matches photos, given by their index in `features`.
 
-    max_features: use only this many features of each photo, those with the largest scale. None uses all.
+    max_features: use only this many features of each photo, or as many as stand for its index, those with the largest
+        scale. None uses all.
     """
 
-    def __init__(self, features: Sequence[Features], max_features: int | None = None) -> None:
+    def __init__(
+        self, features: Sequence[Features], max_features: int | Mapping[int, int] | None = None
+    ) -> None:
         self._features = features
-        self._max_features = max_features
-        most = max((len(photo.scales) for photo in features), default=0)
-        most = max(1, most if max_features is None else min(most, max_features))
+        counts = [len(photo.scales) for photo in features]
+        limits = (
+            max_features
+            if isinstance(max_features, Mapping)
+            else dict.fromkeys(range(len(counts)), max_features)
+        )
+        self._most = [
+            count if (limit := limits[index]) is None else min(count, limit)
+            for index, count in enumerate(counts)
+        ]
+        most = max(1, *self._most, 1)
         # Two are compared at a time in each thread.
         self._directions = lru_cache(max(2, CACHED_BYTES // (most * 128 * 4)))(self._directions_of)
 
@@ -73,8 +84,8 @@ class Matcher:
     def _directions_of(self, photo: int) -> tuple[npt.NDArray[np.int64], torch.Tensor]:
         """Indices [n] of the features used, and their descriptors [n,128] as unit vectors."""
         features = self._features[photo]
-        kept = np.arange(len(features.scales))
-        if self._max_features is not None and len(kept) > self._max_features:
-            kept = np.sort(np.argpartition(-features.scales, self._max_features)[: self._max_features])
+        kept, most = np.arange(len(features.scales)), self._most[photo]
+        if len(kept) > most:
+            kept = np.sort(np.argpartition(-features.scales, most)[:most])
         descriptors = torch.from_numpy(features.descriptors[kept].astype(np.float32))
         return kept, torch.nn.functional.normalize(descriptors, dim=1)

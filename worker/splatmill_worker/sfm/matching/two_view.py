@@ -14,6 +14,7 @@ from splatmill_worker.sfm.callbacks import stop_if
 from splatmill_worker.sfm.features import Features
 from splatmill_worker.sfm.matching.matcher import Matcher, Matches
 from splatmill_worker.sfm.matching.pairs import Pair
+from splatmill_worker.sfm.options import PANORAMA_FEATURES, PANORAMA_SIDE
 
 MIN_INLIERS = 15
 """Inliers from which a pair counts as verified; COLMAP's default."""
@@ -97,17 +98,26 @@ def match_pairs(
     Pairs that the database has already are read, not matched again.
 
     ids: COLMAP's image id of each photo.
-    max_features: features of a photo that are matched. COLMAP's extraction keeps whole octaves and returns up to
-        twice the number asked for, which would make matching four times as slow.
+    max_features: features of a photo that are matched, PANORAMA_FEATURES times as many of a panorama. COLMAP's
+        extraction keeps whole octaves and returns up to twice the number asked for, which would make matching four
+        times as slow.
     """
     cameras = {index: database.read_camera(database.read_image(ids[index]).camera_id) for index in ids}
     options = pycolmap.TwoViewGeometryOptions()
     options.min_num_inliers = MIN_INLIERS
     options.ransac.max_num_trials = MAX_RANSAC_TRIALS
     options.ransac.random_seed = seed
-    longest = max((max(camera.width, camera.height) for camera in cameras.values()), default=1000)
+    # Of the same size of pixels as other photos.
+    sides = (
+        max(each.width, each.height) / (PANORAMA_SIDE if each.is_spherical() else 1.0)
+        for each in cameras.values()
+    )
+    longest = round(max(sides, default=1000))
     options.ransac.max_error = max_error(longest)
-    matcher = Matcher(features, max_features)
+    most = {
+        index: max_features * (PANORAMA_FEATURES if cameras[index].is_spherical() else 1) for index in cameras
+    }
+    matcher = Matcher(features, most)
     ordered = sorted(chosen)
     found: dict[Pair, TwoView] = {}
     fresh: list[Pair] = []

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, Literal
 
 from splatmill.schema.files.photos import MIN_PHOTO_SIDE
 from splatmill_worker.colmap import pycolmap
-from splatmill_worker.images.prepare import CUT_PANORAMAS
-from splatmill_worker.readers.colmap_files import MODELS
+from splatmill_worker.images.lens import PANORAMA
 
 PERSPECTIVE = ("PERSPECTIVE", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 """Names of camera_model in transforms.json for a pinhole with the distortion k1 to k6, p1 and p2."""
@@ -16,12 +15,20 @@ PERSPECTIVE = ("PERSPECTIVE", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RAD
 FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 """Those for an equidistant lens with the distortion k1 to k4."""
 
-PANORAMIC = ("EQUIRECTANGULAR", "SPHERICAL", "LATLONG", "OMNIDIRECTIONALSTEREO", "VR180", "CYLINDRICAL")
-"""Beginnings of the names of models whose photos no pinhole camera shows."""
+PANORAMIC = (PANORAMA, "SPHERICAL", "LATLONG", "OMNIDIRECTIONALSTEREO", "VR180", "CYLINDRICAL")
+"""Beginnings of the names of models of panoramas, of which PANORAMA itself is read."""
 
-OTHER_LENSES = {"latlong": "LATLONG", "equirectangular": "EQUIRECTANGULAR", "ftheta_p0": "FTHETA"}
-"""Fields by which transforms.json of instant-ngp has another lens."""
+OTHER_LENSES = {"latlong": "LATLONG", "equirectangular": "EQUIRECTANGULAR_EQUAL_AREA", "ftheta_p0": "FTHETA"}
+"""Fields by which transforms.json of instant-ngp has another lens. Its equirectangular one has rows of equal area."""
 
+MAX_PANORAMA_ERROR = 0.02
+"""Relative difference from 2:1 up to which a panorama shows all directions: sizes are rounded."""
+
+CUT_PANORAMAS = (
+    "Give panoramas of 360 by 180 degrees, twice as wide as high, with the camera model EQUIRECTANGULAR; or cut these "
+    "into pinhole photos of 90 degrees, the faces of a cube, and give those."
+)
+"""What to do about panoramas that are not read."""
 
 MIN_FOCAL = 0.02
 """Focal length over the longer side below which intrinsics are not in pixels: a pinhole would show 175 degrees across,
@@ -45,7 +52,7 @@ class UnreadModel(ValueError):
         listed = f"Models that are read are {', '.join(known)}"
         if is_panoramic(name):
             return UnreadModel(
-                f"the camera model is {name[:60]}, of panoramas, which no pinhole camera shows. {listed}",
+                f"the camera model is {name[:60]}, of other panoramas than those that are read. {listed}",
                 CUT_PANORAMAS,
             )
         return UnreadModel(
@@ -53,6 +60,17 @@ class UnreadModel(ValueError):
             "Give undistorted photos with pinhole cameras, which most programs can write, or remove the cameras to "
             "have them recovered from the photos.",
         )
+
+
+def panorama(width: int, height: int) -> pycolmap.Camera:
+    """The COLMAP camera of a panorama. Raises ValueError for one that does not show all directions."""
+    if not abs(width / (2.0 * height) - 1.0) <= MAX_PANORAMA_ERROR + 1.0 / height:
+        raise ValueError(
+            f"the camera model is {PANORAMA}, and the photo has {width} x {height} pixels: 360 by 180 degrees are "
+            "twice as wide as high. If it is a part of a panorama, fill the rest with black and mask it; if it is a "
+            "photo of another lens, give the model of that"
+        )
+    return pycolmap.Camera(model=PANORAMA, width=width, height=height, params=[width, height])
 
 
 def check_pixels(camera: pycolmap.Camera) -> None:
@@ -90,17 +108,15 @@ def is_panoramic(name: str) -> bool:
     return name.upper().startswith(PANORAMIC)
 
 
-def is_fisheye(values: dict[str, Any]) -> bool:
-    """Whether the fields of a frame of transforms.json describe a fisheye lens. Raises UnreadModel."""
+def kind_of(values: dict[str, Any]) -> Literal["perspective", "fisheye", "panorama"]:
+    """The kind of lens that the fields of a frame of transforms.json describe. Raises UnreadModel."""
     name = values.get("camera_model") or "OPENCV"
     for field, model in OTHER_LENSES.items():
         if values.get(field) not in (None, False):
             name = model
     known = str(name).upper()
+    if known == PANORAMA:
+        return "panorama"
     if known not in (*PERSPECTIVE, *FISHEYE):
-        raise UnreadModel.named(str(name), (*PERSPECTIVE, *FISHEYE))
-    return known in FISHEYE or bool(values.get("is_fisheye"))
-
-
-COLMAP = tuple(name for name, _ in MODELS.values() if not is_panoramic(name))
-"""COLMAP's models that are read."""
+        raise UnreadModel.named(str(name), (*PERSPECTIVE, *FISHEYE, PANORAMA))
+    return "fisheye" if known in FISHEYE or values.get("is_fisheye") else "perspective"

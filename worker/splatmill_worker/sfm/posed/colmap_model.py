@@ -12,7 +12,7 @@ import numpy.typing as npt
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.errors import UnusablePicture
 from splatmill_worker.images.decoding import decoders
-from splatmill_worker.images.lens import lens_of, pinhole, without_distortion
+from splatmill_worker.images.lens import PANORAMA, lens_of, pinhole, without_distortion
 from splatmill_worker.readers.colmap_files import place
 from splatmill_worker.scene import Camera, Lens, PointViews, Scene, Source, View
 from splatmill_worker.sfm.posed import model_files
@@ -155,11 +155,14 @@ def posed_view(
 
 
 def camera_and_lens(camera: pycolmap.Camera, viewmat: npt.NDArray[np.float64]) -> tuple[Camera, Lens | None]:
-    """The pinhole camera of the undistorted photo, and the lens of the photo itself; None for a pinhole."""
+    """The pinhole camera of the undistorted photo, and the lens of the photo itself; None for a pinhole.
+
+    A panorama has the camera of `without_distortion` until `faces.cut` divides it.
+    """
     lens = lens_of(camera)
-    if lens is not None:
+    if lens is not None and lens.model != PANORAMA:
         return pinhole(lens, viewmat), lens
-    return replace(without_distortion(camera), viewmat=viewmat), None
+    return replace(without_distortion(camera), viewmat=viewmat), lens
 
 
 def fit_to_file(posed: tuple[Camera, Lens | None], name: str, path: Path, mask: Path | None) -> View:

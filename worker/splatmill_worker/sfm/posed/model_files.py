@@ -16,7 +16,7 @@ from splatmill_worker.images.decoding import decoders
 from splatmill_worker.readers import colmap_files
 from splatmill_worker.readers.colmap_files import Arrays
 from splatmill_worker.sfm.posed import camera_models
-from splatmill_worker.sfm.posed.camera_models import IntrinsicsNotInPixels, UnreadModel
+from splatmill_worker.sfm.posed.camera_models import IntrinsicsNotInPixels
 
 MAX_SIDE = 1_000_000
 """Pixels of a side of a camera."""
@@ -160,8 +160,11 @@ def _cameras(arrays: Arrays) -> dict[int, pycolmap.Camera]:
             )
         camera = pycolmap.Camera(model=name, width=width, height=height, params=parameters)
         if camera.is_spherical():
-            error = UnreadModel.named(name, camera_models.COLMAP)
-            raise UnreadModel(f"Camera {number} of the COLMAP model: {error}.", error.advice)
+            try:
+                cameras[number] = camera_models.panorama(width, height)
+            except ValueError as error:
+                raise ValueError(f"Camera {number} of the COLMAP model: {error}.") from error
+            continue
         focal = [parameters[index] for index in camera.focal_length_idxs()]
         if not (np.abs(parameters).max() <= MAX_PARAMETER and min(focal, default=1.0) > 0.0):
             raise ValueError(f"Camera {number} of the COLMAP model has the parameters {parameters.tolist()}.")

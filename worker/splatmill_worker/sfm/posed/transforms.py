@@ -27,7 +27,7 @@ from splatmill_worker.images.decoding import decoders
 from splatmill_worker.readers import point_file
 from splatmill_worker.scene import Scene, Source, View, viewmat_of
 from splatmill_worker.sfm.posed import parts, polycam
-from splatmill_worker.sfm.posed.camera_models import UnreadModel, check_pixels, is_fisheye, radians
+from splatmill_worker.sfm.posed.camera_models import UnreadModel, check_pixels, kind_of, panorama, radians
 from splatmill_worker.sfm.posed.colmap_model import camera_and_lens, fit_to_file
 from splatmill_worker.sfm.posed.encodings import NamesUnclear, chosen
 from splatmill_worker.sfm.posed.files import ImageFiles, alternatives, instead, missing, none_usable
@@ -366,6 +366,9 @@ def _matrix(rows: Any) -> npt.NDArray[np.float64]:
 def _colmap_camera(values: dict[str, Any], size: tuple[int, int]) -> pycolmap.Camera:
     """The camera of a frame, for a photo of this width and height."""
     width, height = size
+    kind = kind_of(values)
+    if kind == "panorama":
+        return panorama(width, height)
 
     def focal(length: str, angle: str, side: int) -> float | None:
         given, seen = _number(values, length), _number(values, angle)
@@ -387,7 +390,7 @@ def _colmap_camera(values: dict[str, Any], size: tuple[int, int]) -> pycolmap.Ca
             f"the focal lengths are {fx} and {fy} pixels; they must be positive, and all intrinsics at most "
             f"{MAX_PARAMETER:.0e}"
         )
-    if is_fisheye(values):
+    if kind == "fisheye":
         model, extra = "OPENCV_FISHEYE", radial[:4]
     elif any(radial[2:]):
         model, extra = "FULL_OPENCV", [*radial[:2], *tangential, *radial[2:]]

@@ -16,7 +16,8 @@ from plyfile import PlyData, PlyElement
 
 from splatmill.files import replacing
 from splatmill_worker.colmap import pycolmap, write_model
-from splatmill_worker.images.lens import colmap_camera
+from splatmill_worker.images.faces import joined
+from splatmill_worker.images.lens import PANORAMA, colmap_camera
 from splatmill_worker.scene import Float, Scene, View
 from splatmill_worker.sfm.posed.transforms import OPENGL_TO_OPENCV
 
@@ -39,9 +40,11 @@ def write_cameras(
     offset: [3], subtracted from the world of `scene` to get to the world of the zip, as in model.ply.
     held_out: names of the views that were held out.
 
-    The cameras are those of the photos as they are, with their lens. Names are those of the photos. Where a lens has no
-    counterpart in transforms.json, that file is left out. Raises OSError.
+    The cameras are those of the photos as they are, with their lens: a panorama is one photo. Names are those of the
+    photos. Where a lens has no counterpart in transforms.json, that file is left out. Raises OSError.
     """
+    held_out = frozenset(view.photo for view in scene.views if view.name in held_out)
+    scene = joined(scene)
     views = [
         replace(view, camera=replace(view.camera, viewmat=viewmats[view.name]))
         if view.name in viewmats
@@ -126,6 +129,10 @@ def transforms_of(views: list[View], held_out: frozenset[str]) -> dict[str, Any]
 
 def _lens(camera: pycolmap.Camera) -> dict[str, Any] | None:
     """The fields of a frame for a camera."""
+    if camera.is_spherical():
+        # nerfstudio has both focal lengths as the height.
+        side = {"w": camera.width, "h": camera.height, "fl_x": camera.height, "fl_y": camera.height}
+        return {"camera_model": PANORAMA, **side, "cx": camera.width / 2, "cy": camera.height / 2}
     name, params = camera.model.name, [float(value) for value in camera.params]
     extra = params[len(params) - len(camera.extra_params_idxs()) :]
     fields: dict[str, Any] = {

@@ -73,7 +73,7 @@ def in_frame(scene: Scene, frame: ModelFrame, known: KnownDistance | None) -> Sc
 
 def scale_by(scene: Scene, known: KnownDistance) -> float:
     """The factor by which a scene grows to metres. Raises Refusal."""
-    centers = {view.name: view.camera.center for view in scene.views}
+    centers = {view.photo: view.camera.center for view in scene.views}
     missing = [name for name in (known.first, known.second) if name not in centers]
     if missing:
         raise Refusal(

@@ -116,6 +116,7 @@ class Facts:
     photos_on_disk: whether they were loaded into files, since that is more than photos may take of the memory.
     seconds_left: what the job has left of the option `within` when the plan is made; None without that option.
     no_lpips: why LPIPS cannot be measured here, a sentence; None where it can.
+    faces: number of photos, held-out ones included, that are faces of panoramas.
     """
 
     views: int
@@ -145,6 +146,7 @@ class Facts:
     photos_on_disk: bool = False
     seconds_left: float | None = None
     no_lpips: str | None = None
+    faces: int = 0
 
     @property
     def pixels(self) -> int:
@@ -189,6 +191,7 @@ def measure(scene: Scene, views: Sequence[TrainingView], held_out: int, speed: S
         transparent=sum(view.full.alpha is not None for view in views),
         masked=sum(view.full.mask is not None for view in views),
         distorted=sum(view.lens is not None for view in scene.views),
+        faces=sum(view.face is not None for view in scene.views),
         halving_loss=float(np.median([halving_loss(view.full.rgb) for view in views])),
         light=None if seen is None else compared(seen, views),
         geometry=None

@@ -164,6 +164,10 @@ def _poses(facts: Facts, kernels: Kernels, scale: float) -> Decision[bool]:
     if facts.views < 2:
         return Decision(False, "A model of one photo fits any camera.")
     seen = f"The median reprojection error is {error:.2f} pixels"
+    if facts.faces:
+        return Decision(
+            False, f"{seen}, but the faces of a panorama share a camera, and would be corrected apart."
+        )
     if error < MIN_POSE_ERROR:
         return Decision(False, f"{seen}; cameras are corrected from {MIN_POSE_ERROR:g} pixel.")
     if kernels == "gpu":

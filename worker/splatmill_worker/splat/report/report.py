@@ -229,7 +229,7 @@ def _unplaced(scene: Scene) -> list[str]:
         return []
     names = [name for name, _ in scene.left_out]
     shown = listed(names, 5)
-    photos = len({*names, *(view.name for view in scene.views)})
+    photos = len({*names, *(view.photo for view in scene.views)})
     verb = "is" if len(names) == 1 else "are"
     return [f"{len(names)} of {photos} photos {verb} not used: {shown}. The report lists the reasons."]
 
