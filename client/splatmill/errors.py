@@ -122,9 +122,9 @@ class JobCancelled(SplatmillError):
 
 
 class WaitTimeout(SplatmillError, TimeoutError):
-    """The job, or the orbit video, has not ended within the given time. It continues.
+    """The job, the orbit video or the mesh has not ended within the given time. It continues.
 
-    job_id: the id of the job or of the video.
+    job_id: the id of the job, the video or the mesh.
     state: the state in which it was last seen.
     """
 

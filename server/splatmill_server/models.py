@@ -392,6 +392,7 @@ def _links(model_id: str) -> dict[str, str]:
         "render": f"{base}/render",
         "orbit": f"{base}/orbit",
         "orbits": f"{base}/orbits",
+        "meshes": f"{base}/meshes",
         "presentation": f"{base}/presentation",
         "formats": f"{base}/formats",
         "html": f"{base}/download/html",

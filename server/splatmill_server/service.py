@@ -25,6 +25,7 @@ from splatmill_server.background.conversions import Conversions
 from splatmill_server.background.deliveries import Deliveries
 from splatmill_server.background.ends import Ends
 from splatmill_server.background.imports import Imports
+from splatmill_server.background.meshes import Meshes
 from splatmill_server.background.orbits import Orbits
 from splatmill_server.background.reaper import Reaper
 from splatmill_server.background.relisting import Relisting
@@ -115,6 +116,7 @@ class Service:
     shares: Shares
     conversions: Conversions
     orbits: Orbits
+    meshes: Meshes
     presentations: Presentations
     keys: Keys
     authentication: Authentication
@@ -178,6 +180,7 @@ class Service:
             shares=Shares(storage, connection, models),
             conversions=Conversions(storage, connection, models, renderer, quota, settings.orbit_timeout),
             orbits=Orbits(storage, connection, models, renderer, quota, settings.orbit_timeout),
+            meshes=Meshes(storage, connection, models, renderer, quota, settings.orbit_timeout),
             presentations=Presentations(
                 storage, connection, models, renderer, quota, settings.render_timeout
             ),

@@ -28,7 +28,7 @@ from splatmill.schema import (
 from splatmill.transfer import chunked_uploads
 from splatmill_server import webhooks
 from splatmill_server.access import keys
-from splatmill_server.background import deliveries, imports, orbits, sweeper
+from splatmill_server.background import deliveries, imports, kept, meshes, orbits, sweeper
 from splatmill_server.base import lists as listing
 from splatmill_server.base import outgoing, paging
 from splatmill_server.base.settings import Settings
@@ -133,7 +133,7 @@ SENTENCES: list[tuple[str, Callable[[], str]]] = [
         lambda: f"copy takes over {word(mirror.CHECKPOINT_SHARE * mirror.CHECKPOINT_INTERVAL)} seconds",
     ),
     ("serving", lambda: f"clients that follow events ({default('max_event_streams')})"),
-    ("serving", lambda: f"one that ends {word(orbits.MAX_ATTEMPTS)} times in the same part"),
+    ("serving", lambda: f"one that ends {word(kept.MAX_ATTEMPTS)} times in the same part"),
     ("serving", lambda: f"more than {100 * memory.ALARM:.0f}% of its `maxmemory`"),
     ("serving", lambda: f"(from {bound('priority', 'ge')} to {bound('priority', 'le')}, by default 0)"),
     ("webhooks", lambda: f"is sent again** after {pauses()}"),
@@ -161,7 +161,16 @@ SENTENCES: list[tuple[str, Callable[[], str]]] = [
     ("storage", lambda: f"Listings take at most {share(usage.SCAN_SHARE)} of the time"),
     (
         "rest",
-        lambda: f"at most {orbits.MAX_UNFINISHED} wait, and a model keeps at most {orbits.MAX_OF_MODEL}",
+        lambda: (
+            f"at most {orbits.Orbits.most_unfinished} wait, and a model keeps at most {orbits.Orbits.most_of_model}"
+        ),
+    ),
+    (
+        "rest",
+        lambda: (
+            f"At most {meshes.Meshes.most_unfinished} of an owner wait, and a model keeps at most "
+            f"{meshes.Meshes.most_of_model}"
+        ),
     ),
     ("rest", lambda: f"are kept apart, up to {events.BOUNDS[redis_keys.log]} each"),
     ("rest", lambda: f"up to {word(estimate.ALIKE)} jobs that are most alike"),

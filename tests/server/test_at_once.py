@@ -104,9 +104,9 @@ def test_imports_that_have_not_ended(
     assert statuses(apps, ask) == {202: 3, 429: AT_ONCE - 3}
 
 
-@pytest.mark.parametrize("limit", ["MAX_UNFINISHED", "MAX_OF_MODEL"])
+@pytest.mark.parametrize("limit", ["most_unfinished", "most_of_model"])
 def test_orbit_videos(apps: list[ServedApp], limit: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(orbits, limit, 3)
+    monkeypatch.setattr(orbits.Orbits, limit, 3)
     path = f"/v1/models/{MODEL}/orbits"
     found = statuses(apps, lambda http, number: http.post(path, json={"fps": 5 + number}))
     assert found == {202: 3, 409: AT_ONCE - 3}

@@ -9,7 +9,7 @@ from typing import Any, Literal
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from splatmill.schema import ChangePresentation, OrbitRequest, RenderRequest, TrainOptions
+from splatmill.schema import ChangePresentation, MeshRequest, OrbitRequest, RenderRequest, TrainOptions
 from splatmill.schema.base import Request
 from tests.support.paths import ROOT
 
@@ -23,6 +23,7 @@ CLASSES: tuple[tuple[str, type[Request], str], ...] = (
         "How an image is rendered: the fields of `RenderRequest` but the camera.",
     ),
     ("OrbitArguments", OrbitRequest, "How a video is rendered: the fields of `OrbitRequest`."),
+    ("MeshArguments", MeshRequest, "How a mesh is made: the fields of `MeshRequest`."),
     (
         "PresentationArguments",
         ChangePresentation,
@@ -41,7 +42,7 @@ def text() -> str:
     """The whole module."""
     names = sorted({name for _, model, _ in CLASSES for name in _names(model)})
     head = [
-        '"""The keyword arguments of `train`, `render`, `orbit` and `present`, for editors and type checkers.',
+        '"""The keyword arguments of `train`, `render`, `orbit`, `mesh` and `present`, for editors and type checkers.',
         "",
         "Generated from the schema by `python -m tests.support.arguments`.",
         '"""',

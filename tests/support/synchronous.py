@@ -18,7 +18,7 @@ from tests.support.paths import ROOT
 PACKAGE = ROOT / "client" / "splatmill" / "sdk"
 
 SOURCES = {
-    "client_records.py": ("bin", "imports", "keys", "orbits", "shares", "webhooks"),
+    "client_records.py": ("bin", "imports", "keys", "meshes", "orbits", "shares", "webhooks"),
     "client.py": ("model", "job", "aio"),
 }
 """The modules of asynchronous classes for each generated file. A class stands after those that its methods return."""
@@ -48,7 +48,9 @@ def text(name: str) -> str:
     made += 'Generated from these by `python -m tests.support.synchronous`.\n"""\n'
     made += "from collections.abc import Iterator\nfrom splatmill.sdk.loop import BackgroundLoop\n"
     if name == "client.py":
-        made += "from splatmill.sdk.client_records import Bin, Imports, Keys, Orbits, Shares, Webhooks\n"
+        made += (
+            "from splatmill.sdk.client_records import Bin, Imports, Keys, Meshes, Orbits, Shares, Webhooks\n"
+        )
     classes = []
     for module, source in sources.items():
         for node in ast.parse(source).body:

@@ -67,6 +67,10 @@ def main(argv: list[str] | None = None) -> int:
     mesh.add_argument("--voxel", type=float, help="side of a voxel, units of the model")
     mesh.add_argument("--box", help="lower and upper corner as JSON")
     mesh.add_argument("--up", default="-y", help="axis that points up, for a model without cameras")
+    mesh.add_argument(
+        "--backend", choices=["reference", "cpu", "gpu"], help="kernels to render with (default: cpu)"
+    )
+    mesh.add_argument("--parent", type=int, help="process that reads lines of JSON, with which this one ends")
     text = programs.add_parser("model-text", help="turn the files of a COLMAP model from binary to text")
     text.add_argument("folder", type=Path)
     fit_image = programs.add_parser("fit-image", help="fit one image by Gaussians in a plane")

@@ -5,9 +5,12 @@ only forwards them; for what it keeps, it asks in its own name. The renderer com
 itself.
 """
 
+import builtins
 import hashlib
 
 from pydantic import BaseModel
+
+from splatmill.schema import MeshFacts, Problem, Progress
 
 HEALTH = "/healthz"
 """The path at which the renderer answers that it runs, and with its `RendererState`."""
@@ -31,6 +34,24 @@ class RendererState(BaseModel):
     status: str | None = None
     admitted: int = 0
     cached: int = 0
+
+
+class MeshLine(BaseModel):
+    """A line of JSON in the answer of the renderer while it makes a mesh; one field is set, or the last two are.
+
+    progress: what it does. It comes again and again, so that silence means that the renderer has ended.
+    problem: why there is no mesh; nothing follows.
+    facts, bytes: what the mesh is made of, and the size of the file, which follows the line.
+    """
+
+    progress: Progress | None = None
+    problem: Problem | None = None
+    facts: MeshFacts | None = None
+    bytes: int | None = None
+
+    def encoded(self) -> "builtins.bytes":
+        """The line with its end."""
+        return self.model_dump_json(exclude_none=True).encode() + b"\n"
 
 
 def client_of(owner: str, client: str) -> str:
@@ -72,6 +93,11 @@ def edits_path(model_id: str) -> str:
     Its header EDIT_HEADER holds the `Edited`, as JSON.
     """
     return f"/v1/models/{model_id}/edits"
+
+
+def mesh_path(model_id: str) -> str:
+    """Return the path to which a `MeshRequest` is posted; the response is lines (`MeshLine`) and then the file."""
+    return f"/v1/models/{model_id}/mesh"
 
 
 def address(url: str) -> tuple[str, str | None]:

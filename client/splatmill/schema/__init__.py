@@ -173,6 +173,7 @@ if TYPE_CHECKING:
         LogLine,
         LogPage,
     )
+    from splatmill.schema.resources.kept import Kept, KeptState
     from splatmill.schema.resources.labels import ChangeLabels
     from splatmill.schema.resources.live import (
         SNAPSHOT_MEDIA_TYPE,
@@ -181,6 +182,7 @@ if TYPE_CHECKING:
         UnusedPhoto,
         Watch,
     )
+    from splatmill.schema.resources.meshes import Mesh, MeshFacts, MeshFormat, MeshList, MeshRequest
     from splatmill.schema.resources.models import (
         HELD_OUT,
         TIME_LAPSE,
@@ -198,7 +200,6 @@ if TYPE_CHECKING:
         Orbit,
         OrbitFrames,
         OrbitList,
-        OrbitState,
     )
     from splatmill.schema.resources.presentation import (
         MOST_MARKS,
@@ -342,6 +343,8 @@ __all__ = [
     "JobPage",
     "JobState",
     "JoinOrbit",
+    "Kept",
+    "KeptState",
     "Key",
     "KeyLimits",
     "KeyList",
@@ -361,6 +364,11 @@ __all__ = [
     "Me",
     "Measured",
     "Measurement",
+    "Mesh",
+    "MeshFacts",
+    "MeshFormat",
+    "MeshList",
+    "MeshRequest",
     "MetricEvent",
     "Model",
     "ModelCamera",
@@ -380,7 +388,6 @@ __all__ = [
     "OrbitFrames",
     "OrbitList",
     "OrbitRequest",
-    "OrbitState",
     "Output",
     "Owner",
     "OwnerUse",

@@ -1,4 +1,4 @@
-"""The keyword arguments of `train`, `render`, `orbit` and `present`, for editors and type checkers.
+"""The keyword arguments of `train`, `render`, `orbit`, `mesh` and `present`, for editors and type checkers.
 
 Generated from the schema by `python -m tests.support.arguments`.
 """
@@ -11,6 +11,7 @@ from splatmill.schema import (
     Annotation,
     Backend,
     Background,
+    Box,
     CameraPath,
     CameraSpec,
     Effort,
@@ -18,6 +19,7 @@ from splatmill.schema import (
     Mapper,
     Matcher,
     Measurement,
+    MeshFormat,
     Output,
     Preset,
     Scale,
@@ -79,6 +81,15 @@ class OrbitArguments(TypedDict, total=False):
     fov_y_deg: float | None
     background: Literal["black", "white"]
     camera_path: CameraPath | Mapping[str, Any] | None
+
+
+class MeshArguments(TypedDict, total=False):
+    """How a mesh is made: the fields of `MeshRequest`."""
+
+    format: MeshFormat | Literal["glb", "ply"]
+    faces: int
+    voxel: float | None
+    box: Box | Mapping[str, Any] | None
 
 
 class PresentationArguments(TypedDict, total=False):

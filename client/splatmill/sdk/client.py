@@ -37,8 +37,14 @@ from splatmill.schema import (
     TrainOptions,
 )
 from splatmill.sdk.aio import AsyncClient
-from splatmill.sdk.arguments import OrbitArguments, PresentationArguments, RenderArguments, TrainArguments
-from splatmill.sdk.client_records import Bin, Imports, Keys, Orbits, Shares, Webhooks
+from splatmill.sdk.arguments import (
+    MeshArguments,
+    OrbitArguments,
+    PresentationArguments,
+    RenderArguments,
+    TrainArguments,
+)
+from splatmill.sdk.client_records import Bin, Imports, Keys, Meshes, Orbits, Shares, Webhooks
 from splatmill.sdk.job import MOST_LINES, AsyncJobHandle
 from splatmill.sdk.loop import BackgroundLoop
 from splatmill.sdk.model import AsyncModelHandle
@@ -56,6 +62,7 @@ class ModelHandle:
         self._async = twin
         self.shares = Shares(self._loop, self._async.shares)
         self.orbits = Orbits(self._loop, self._async.orbits)
+        self.meshes = Meshes(self._loop, self._async.meshes)
 
     @property
     def model(self) -> Model:
@@ -152,6 +159,27 @@ class ModelHandle:
         return self._loop.run_reporting(
             lambda report: self._async.orbit(path, timeout=timeout, on_progress=report, keep=keep, **options),
             on_progress,
+        )
+
+    def mesh(
+        self,
+        path: AnyPath,
+        *,
+        timeout: float | None = None,
+        on_progress: OnProgress | None = None,
+        **options: Unpack[MeshArguments],
+    ) -> Path:
+        """Make a mesh of the model: triangles with a colour at each vertex. Write it to `path`, and return that.
+
+        `options` are the fields of `MeshRequest`; the format is that of the suffix of `path`, if it has one of them.
+        `timeout` is the number of seconds to wait for the mesh; left out, as long as it takes. `on_progress` is called
+        with what is being done. The server keeps the mesh with the model, where the same options find it again.
+
+        Raises InvalidRequest for options that are not valid. After the timeout it raises WaitTimeout, and the server
+        continues.
+        """
+        return self._loop.run_reporting(
+            lambda report: self._async.mesh(path, timeout=timeout, on_progress=report, **options), on_progress
         )
 
     def edit(

@@ -1,4 +1,4 @@
-"""The synchronous twins of the classes in `bin`, `imports`, `keys`, `orbits`, `shares`, `webhooks`.
+"""The synchronous twins of the classes in `bin`, `imports`, `keys`, `meshes`, `orbits`, `shares`, `webhooks`.
 
 Generated from these by `python -m tests.support.synchronous`.
 """
@@ -15,6 +15,7 @@ from splatmill.schema import (
     Key,
     KeyLimits,
     KeyWithSecret,
+    Mesh,
     Orbit,
     Role,
     Scope,
@@ -24,11 +25,12 @@ from splatmill.schema import (
     WebhookEvent,
     WebhookWithSecret,
 )
-from splatmill.sdk.arguments import OrbitArguments
+from splatmill.sdk.arguments import MeshArguments, OrbitArguments
 from splatmill.sdk.bin import AsyncBin
 from splatmill.sdk.imports import AsyncImports
 from splatmill.sdk.keys import AsyncKeys
 from splatmill.sdk.loop import BackgroundLoop
+from splatmill.sdk.meshes import AsyncMeshes
 from splatmill.sdk.orbits import AsyncOrbits
 from splatmill.sdk.shares import AsyncShares
 from splatmill.sdk.webhooks import AsyncWebhooks
@@ -154,6 +156,57 @@ class Keys:
     def rotate(self, key_id: str, *, grace: float | str = 0.0) -> KeyWithSecret:
         """Give a key a new secret. The former one stays valid for `grace`: seconds, or a text such as `1h`."""
         return self._loop.run(self._async.rotate(key_id, grace=grace))
+
+
+class Meshes:
+    """Starts, follows, lists and deletes the meshes of a model, which the server makes in the background."""
+
+    def __init__(self, loop: BackgroundLoop, twin: AsyncMeshes) -> None:
+        self._loop = loop
+        self._async = twin
+
+    def start(self, **options: Unpack[MeshArguments]) -> Mesh:
+        """Let the server make a mesh in the background, and keep it with the model.
+
+        `options` are the fields of `MeshRequest`. The same options return the same mesh, also one that is whole. Raises
+        InvalidRequest for options that are not valid, and Conflict where there are too many meshes.
+        """
+        return self._loop.run(self._async.start(**options))
+
+    def get(self, mesh_id: str) -> Mesh:
+        """Return a mesh: its state, what is being done, and at the end its triangles and size, or the problem.
+
+        Raises NotFound for a mesh that does not exist.
+        """
+        return self._loop.run(self._async.get(mesh_id))
+
+    def wait(self, mesh_id: str, on_progress: OnProgress | None = None) -> Mesh:
+        """Wait until a mesh is whole, and return it.
+
+        on_progress: called with what is being done.
+
+        Raises a subclass of `Refused` with the problem of a mesh that has failed, and NotFound for one that somebody
+        deletes meanwhile.
+        """
+        return self._loop.run_reporting(lambda report: self._async.wait(mesh_id, report), on_progress)
+
+    def list(self) -> list[Mesh]:
+        """Return the meshes of the model, newest first."""
+        return self._loop.run(self._async.list())
+
+    def download(self, mesh_id: str, path: AnyPath) -> Path:
+        """Download a mesh that is whole to `path`, a file or an existing folder, and return the path written.
+
+        Raises Conflict for a mesh that is not whole, NotFound, DownloadFailed, ConnectionFailed or OSError.
+        """
+        return self._loop.run(self._async.download(mesh_id, path))
+
+    def delete(self, mesh_id: str) -> None:
+        """Delete a mesh; one that is not whole is not made any further.
+
+        Raises NotFound for a mesh that does not exist.
+        """
+        self._loop.run(self._async.delete(mesh_id))
 
 
 class Orbits:

@@ -18,6 +18,7 @@ from splatmill.schema import (
     ChangePresentation,
     Edited,
     EditModel,
+    MeshFormat,
     Model,
     ModelCamera,
     ModelCameras,
@@ -28,7 +29,8 @@ from splatmill.schema import (
     RenderRequest,
     Selection,
 )
-from splatmill.sdk.arguments import OrbitArguments, PresentationArguments, RenderArguments
+from splatmill.sdk.arguments import MeshArguments, OrbitArguments, PresentationArguments, RenderArguments
+from splatmill.sdk.meshes import AsyncMeshes
 from splatmill.sdk.orbits import AsyncOrbits, orbit_request
 from splatmill.sdk.shares import AsyncShares
 from splatmill.transfer.connection import Connection, read_answer
@@ -59,6 +61,7 @@ class AsyncModelHandle:
         """The record of the model."""
         self.shares = AsyncShares(connection, model.id)
         self.orbits = AsyncOrbits(connection, model.id)
+        self.meshes = AsyncMeshes(connection, model.id)
 
     @property
     def id(self) -> str:
@@ -224,6 +227,36 @@ class AsyncModelHandle:
         )
         atomic_write(target, response.content)
         return target
+
+    async def mesh(
+        self,
+        path: AnyPath,
+        *,
+        timeout: float | None = None,
+        on_progress: OnProgress | None = None,
+        **options: Unpack[MeshArguments],
+    ) -> Path:
+        """Make a mesh of the model: triangles with a colour at each vertex. Write it to `path`, and return that.
+
+        `options` are the fields of `MeshRequest`; the format is that of the suffix of `path`, if it has one of them.
+        `timeout` is the number of seconds to wait for the mesh; left out, as long as it takes. `on_progress` is called
+        with what is being done. The server keeps the mesh with the model, where the same options find it again.
+
+        Raises InvalidRequest for options that are not valid. After the timeout it raises WaitTimeout, and the server
+        continues.
+        """
+        suffix = Path(path).suffix.lower().removeprefix(".")
+        if suffix in MeshFormat.__members__:
+            options.setdefault("format", MeshFormat(suffix))
+        begun = await self.meshes.start(**options)
+        try:
+            async with asyncio.timeout(timeout) as limit:
+                await self.meshes.wait(begun.id, on_progress)
+        except TimeoutError as error:
+            if not limit.expired() or timeout is None:
+                raise
+            raise WaitTimeout(begun.id, "not whole", timeout, "mesh") from error
+        return await self.meshes.download(begun.id, path)
 
     async def edit(
         self,

@@ -78,8 +78,8 @@ class Metrics:
         )
         self.renders = self._counter(
             "splatmill_renders",
-            "Requests to the renderer, by kind (render, orbit, frames and join of a kept orbit, convert, edits) and "
-            "result: made, not_modified, refused (its queue is full), abandoned (the client has left), timeout, "
+            "Requests to the renderer, by kind (render, orbit, frames and join of a kept orbit, convert, edits, mesh) "
+            "and result: made, not_modified, refused (its queue is full), abandoned (the client has left), timeout, "
             "unreachable or failed.",
             "kind",
             "result",

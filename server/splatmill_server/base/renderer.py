@@ -102,5 +102,5 @@ class CountingTransport(httpx.AsyncBaseTransport):
         await self._transport.aclose()
 
 
-_KINDS = frozenset({"render", "orbit", "frames", "join", "convert", "edits"})
+_KINDS = frozenset({"render", "orbit", "frames", "join", "convert", "edits", "mesh"})
 _RESULTS = {200: "made", 204: "made", 304: "not_modified", 499: "abandoned", 503: "refused"}

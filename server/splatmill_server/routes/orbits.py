@@ -6,6 +6,7 @@ from fastapi import APIRouter, Body, Path, Request
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
+from splatmill.backplane.storage import layout
 from splatmill.schema import Orbit, OrbitList, OrbitRequest
 from splatmill_server.access.caller import Who
 from splatmill_server.requests.ownership import ModelId
@@ -91,5 +92,6 @@ async def get_orbit_video(
     service: Shared, model_id: ModelId, orbit_id: OrbitId, request: Request
 ) -> Response:
     """Download an orbit video (MP4)."""
-    path = await run_in_threadpool(service.orbits.get_video_path, model_id, orbit_id)
+    await run_in_threadpool(service.orbits.get_whole, model_id, orbit_id)
+    path = layout.orbit_video(model_id, orbit_id)
     return await file_response(request, service.storage, path, "video/mp4")

@@ -101,6 +101,7 @@ def world(serve: Serve) -> World:
     ids = {"capture_id": capture, "job_id": waiting, "model_id": done, "key_id": ann["id"]}
     ids["share_id"] = "fedcba98"  # guarded by its model
     ids["orbit_id"] = "0" * 16  # guarded by its model
+    ids["mesh_id"] = "0" * 16  # guarded by its model
     ids["import_id"] = "0" * 16  # guarded by its capture
     ids["webhook_id"] = app.http.post("/v1/webhooks", json={"url": "http://8.8.8.8/"}).json()["id"]
     ids["delivery_id"] = "0" * 16  # guarded by its webhook

@@ -23,7 +23,7 @@ from splatmill.backplane.storage import layout
 from splatmill.errors import InvalidRequest, NotFound, ServerError, WaitTimeout
 from splatmill.schema import OrbitRequest, Progress
 from splatmill.sdk.client import Client
-from splatmill_server.background import orbits
+from splatmill_server.background import kept, orbits
 from splatmill_server.space import usage
 from tests.support.ball import write_ply
 from tests.support.command_line import invoke, spawn
@@ -52,8 +52,8 @@ def renderer(folder: Path) -> Iterator[subprocess.Popen[bytes]]:
 @pytest.fixture(autouse=True)
 def _small_parts_and_short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(orbits, "PART_FRAMES", (1, 4))
-    monkeypatch.setattr(orbits, "_PAUSE_SECONDS", 0.02)
-    monkeypatch.setattr(orbits, "_LOOK_SECONDS", 0.2)
+    monkeypatch.setattr(kept, "_PAUSE_SECONDS", 0.02)
+    monkeypatch.setattr(kept, "_LOOK_SECONDS", 0.2)
 
 
 @pytest.fixture
@@ -66,7 +66,7 @@ def app(serve: Serve, folder: Path, renderer: subprocess.Popen[bytes]) -> Served
 def store_ball_as(app: ServedApp, model_id: str, folder: Path) -> None:
     storage = app.service.storage
     storage.delete_prefix(layout.model(model_id))
-    storage.delete_prefix(layout.unfinished_orbits())
+    storage.delete_prefix(layout.unfinished_kept("orbits"))
     store_model(app.service, model_id)
     write_ply(folder / "model.ply")
     storage.put(layout.model_file(model_id, "model.ply"), folder / "model.ply")
@@ -88,11 +88,11 @@ def ended(app: ServedApp, orbit_id: str) -> dict[str, Any]:
 
 
 def marks(app: ServedApp) -> list[str]:
-    return [entry.path for entry in app.service.storage.entries(layout.unfinished_orbits())]
+    return [entry.path for entry in app.service.storage.entries(layout.unfinished_kept("orbits"))]
 
 
 def files(app: ServedApp) -> list[str]:
-    folder = layout.model_orbits(MODEL) + "/"
+    folder = layout.kept_of(MODEL, "orbits") + "/"
     return [entry.path.removeprefix(folder) for entry in app.service.storage.entries(folder)]
 
 
@@ -104,7 +104,7 @@ def frames(video: bytes) -> list[Any]:
 def test_a_video_waits_while_storage_is_listed_for_the_first_time(
     serve: Serve, folder: Path, renderer: subprocess.Popen[bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(orbits, "_PAUSE_SECONDS", 0.3)
+    monkeypatch.setattr(kept, "_PAUSE_SECONDS", 0.3)
     monkeypatch.setattr(usage, "_FIRST_SCAN_SECONDS", 0.1)
     app = serve(renderer_url=f"unix:{folder}/r.sock", storage=str(folder / "storage"), quota=10**9)
     store_ball_as(app, MODEL, folder)
@@ -226,13 +226,13 @@ def test_a_renderer_that_is_away_is_waited_for_and_one_that_dies_is_asked_again(
     async def heard(*args: Any) -> None:
         try:
             await ask(*args)
-        except orbits._Delayed as delay:
+        except kept.Delayed as delay:
             counted.append(delay.counts)
             raise
 
     monkeypatch.setattr(app.service.orbits, "_ask", heard)
     made = begun(app)
-    wait_for(lambda: len(counted) > orbits.MAX_ATTEMPTS)
+    wait_for(lambda: len(counted) > kept.MAX_ATTEMPTS)
     assert not any(counted), "a renderer that cannot be reached has tried nothing"
     assert app.http.get(f"{ORBITS}/{made['id']}").json()["state"] == "queued"
     with socket.socket(socket.AF_UNIX) as listener:
@@ -286,8 +286,8 @@ def test_what_is_refused_is_refused_before_it_waits(
     problem(app.http.post("/v1/models/0123456789abcdef/orbits", json=WISH), 404, "model_not_found")
     problem(app.http.get(f"{ORBITS}/..%2f..%2fx"), 404, "not_found")
     problem(app.http.get(f"{ORBITS}/0123456789abcdef"), 404, "orbit_not_found")
-    monkeypatch.setattr(orbits, "MAX_UNFINISHED", 2)
-    monkeypatch.setattr(orbits, "MAX_OF_MODEL", 2)
+    monkeypatch.setattr(orbits.Orbits, "most_unfinished", 2)
+    monkeypatch.setattr(orbits.Orbits, "most_of_model", 2)
     renderer.send_signal(signal.SIGSTOP)
     try:
         two = [begun(app)["id"], begun(app, fps=11)["id"]]
@@ -309,7 +309,7 @@ def test_what_is_refused_is_refused_before_it_waits(
 def test_a_broken_record_hides_no_other(app: ServedApp) -> None:
     made = ended(app, begun(app)["id"])
     broken = {"id": "0" * 16, "model": MODEL, "state": "later"}
-    app.service.storage.put(layout.orbit_record(MODEL, "0" * 16), json.dumps(broken).encode())
+    app.service.storage.put(layout.kept_record(MODEL, "orbits", "0" * 16), json.dumps(broken).encode())
     assert [found["id"] for found in app.http.get(ORBITS).json()["orbits"]] == [made["id"]]
 
 
@@ -382,9 +382,9 @@ def test_a_video_has_failed_after_an_error_that_nobody_expected(
         asked.append(1)
         raise RecursionError
 
-    monkeypatch.setattr(orbits, "post", broken)
+    monkeypatch.setattr(kept, "post", broken)
     made = begun(app)
     wait_for(lambda: app.http.get(made["links"]["self"]).json()["state"] == "failed")
     assert "RecursionError" in app.http.get(made["links"]["self"]).json()["problem"]["detail"]
-    assert not list(app.service.storage.entries(layout.unfinished_orbits()))
+    assert not list(app.service.storage.entries(layout.unfinished_kept("orbits")))
     assert len(asked) == 1

@@ -110,13 +110,15 @@ def test_every_address_in_an_answer_leads_through_the_proxy(
         app.begin(job)
         app.finish(job)
         shown = http.get(f"/v1/models/{job}")
-        for name in ("self", "job", "cameras", "formats", "ply", "report", "orbits"):
+        for name in ("self", "job", "cameras", "formats", "ply", "report", "orbits", "meshes"):
             assert followed(http, shown, shown.json()["links"][name]).status_code == 200, name
         formats = http.get(f"/v1/models/{job}/formats")
         assert followed(http, formats, formats.json()["formats"][0]["address"]).content.startswith(b"ply")
         orbit = http.post(f"/v1/models/{job}/orbits", json={})
         assert orbit.status_code == 202, orbit.text
         assert followed(http, orbit, orbit.json()["links"]["self"]).json()["id"] == orbit.json()["id"]
+        mesh = http.post(f"/v1/models/{job}/meshes", json={})
+        assert followed(http, mesh, mesh.json()["links"]["self"]).json()["id"] == mesh.json()["id"]
 
         share = http.post(f"/v1/models/{job}/shares")
         assert share.headers["location"] == share.json()["path"]

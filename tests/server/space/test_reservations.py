@@ -116,7 +116,7 @@ def test_orbit_videos_fail_where_the_quota_ends(app: ServedApp) -> None:
     assert {answer.status_code for answer in made} <= {202, 507}
 
     def ended() -> bool:
-        return not list(app.service.storage.entries(layout.unfinished_orbits()))
+        return not list(app.service.storage.entries(layout.unfinished_kept("orbits")))
 
     seen = 0
     while not ended():

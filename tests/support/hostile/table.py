@@ -8,6 +8,7 @@ from tests.support.hostile.table_decoders import DECODERS
 from tests.support.hostile.table_files import FILES
 from tests.support.hostile.table_headers import HEADERS
 from tests.support.hostile.table_lenses import LENSES
+from tests.support.hostile.table_meshes import MESHES
 from tests.support.hostile.table_models import MODELS
 from tests.support.hostile.table_others import OTHERS
 from tests.support.hostile.table_panoramas import PANORAMAS
@@ -32,6 +33,7 @@ HOSTILE: tuple[Hostile, ...] = (
     *PROGRAMS,
     *LENSES,
     *MODELS,
+    *MESHES,
     *DECODERS,
     *COLORS,
     *PANORAMAS,

@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 import torch
 
+from splatmill.schema import Progress
 from splatmill_worker.mesh import build as building
 from splatmill_worker.mesh.build import NoSurface, Wanted, build, chosen
 from splatmill_worker.mesh.depths import View, confirmed
-from splatmill_worker.mesh.fusion import Region, TooLarge, fuse
+from splatmill_worker.mesh.poisson import TooFine
 from splatmill_worker.scene import Camera
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.synthetic.ray_caster import look_at
@@ -53,7 +54,7 @@ def views() -> list[View]:
 
 
 def test_a_ball_becomes_a_round_mesh_with_its_colours(views: list[View]) -> None:
-    stages: list[str] = []
+    stages: list[Progress] = []
     built = build(ball(), cameras(), Wanted(20_000), told=stages.append, views=views)
     radii = np.linalg.norm(built.mesh.vertices, axis=1)
     assert np.abs(radii - 1.0).max() < 2 * built.voxel
@@ -66,7 +67,7 @@ def test_a_ball_becomes_a_round_mesh_with_its_colours(views: list[View]) -> None
     assert (reddish == (built.mesh.vertices[:, 0] > 0))[sure].mean() > 0.995
     assert built.views == 12
     assert built.extracted >= len(built.mesh.faces) > 2000
-    assert stages[-1] == "colouring the surface"
+    assert stages[-1].stage == "colouring the surface"
 
 
 def test_the_box_and_the_number_of_triangles_are_kept(views: list[View]) -> None:
@@ -103,15 +104,12 @@ def test_without_a_surface_it_is_refused(views: list[View]) -> None:
         build(ball(), cameras(), Wanted(1000, box=((5.0, 5.0, 5.0), (6.0, 6.0, 6.0))), views=views)
 
 
-def test_voxels_that_need_too_many_blocks_are_refused_or_become_larger(
-    views: list[View], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("splatmill_worker.mesh.fusion.MOST_BLOCKS", 300)
-    with pytest.raises(TooLarge, match="300 are kept"):
-        build(ball(), cameras(), Wanted(1000, voxel=0.01), views=views)
-    field = fuse(views, 0.01, Region(10.0))
-    assert field.voxel > 0.02
-    assert len(field.blocks) <= 300
+def test_voxels_that_are_too_fine_are_refused_or_become_larger(views: list[View]) -> None:
+    with pytest.raises(TooFine, match=r"0\.00\d+ is the least"):
+        build(ball(), cameras(), Wanted(1000, voxel=1e-5), views=views)
+    coarse = build(ball(), cameras(), Wanted(20_000, voxel=0.1), views=views)
+    assert 0.05 < coarse.voxel <= 0.1
+    assert coarse.extracted < 10_000
 
 
 def test_of_many_cameras_an_even_choice_is_used_at_a_bounded_size(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -23,7 +23,15 @@ from tests.worker.mesh.test_triangles import chunks
 
 
 def chosen(model: Path, out: Path, **options: Any) -> Namespace:
-    plain = {"faces": 5000, "voxel": None, "box": None, "cameras": None, "up": "z"}
+    plain = {
+        "faces": 5000,
+        "voxel": None,
+        "box": None,
+        "cameras": None,
+        "up": "z",
+        "backend": None,
+        "parent": None,
+    }
     return Namespace(model=model, out=out, **{**plain, **options})
 
 
@@ -86,7 +94,7 @@ def test_rings_stand_around_the_model_above_and_below_it() -> None:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"voxel": 1e-5}, "Choose larger voxels or a box"),
+        ({"voxel": 1e-5}, "Choose larger voxels or a smaller box"),
         ({"box": '{"min": [5, 5, 5], "max": [6, 6, 6]}'}, "No two cameras agree on a surface"),
         ({"cameras": "model.ply"}, "is not the cameras.json of a model"),
         ({"cameras": "absent.json"}, "absent.json: No such file"),

@@ -1,4 +1,4 @@
-"""Meshes by other means: COLMAP's Poisson reconstruction of points with normals, and Open3D's fusion of depths."""
+"""Meshes by other means: COLMAP's Poisson reconstruction of its sparse points, and Open3D's fusion of depths."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from zipfile import ZipFile
 import numpy as np
 import numpy.typing as npt
 import torch
-from plyfile import PlyData, PlyElement
 from scipy.spatial import cKDTree
 
 from splatmill_worker.colmap import pycolmap
-from splatmill_worker.mesh import ply
 from splatmill_worker.mesh.depths import View
+from splatmill_worker.mesh.poisson import reconstruct
+from splatmill_worker.mesh.samples import Samples
 from splatmill_worker.mesh.triangles import Mesh
 
 Float = npt.NDArray[np.float64]
@@ -24,46 +24,12 @@ Float = npt.NDArray[np.float64]
 POISSON_DEPTH = 10
 """Levels of the octree: cells of a thousandth of the points' extent."""
 
-TRIM = POISSON_DEPTH - 3
-"""Level below which surface is cut away. COLMAP's default, 10, removes every face at this depth."""
-
 NEIGHBOURS = 12
 """Points through which the plane of a sparse point is laid."""
 
 
 class Missing(Exception):
     """A library of the comparison is not installed."""
-
-
-def poisson(points: Float, normals: Float, colors: npt.NDArray[np.uint8]) -> Mesh:
-    """COLMAP's screened Poisson reconstruction of points with normals and colours, [n, 3] each."""
-    names = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")]
-    rows = np.empty(len(points), [*names, *((name, "u1") for name in ply.CHANNELS)])
-    for name, column in zip(rows.dtype.names or (), [*points.T, *normals.T, *colors.T], strict=True):
-        rows[name] = column
-    with tempfile.TemporaryDirectory(prefix="splatmill-bench-") as folder:
-        source, target = Path(folder) / "points.ply", Path(folder) / "mesh.ply"
-        PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(source))
-        options = pycolmap.PoissonMeshingOptions()
-        options.depth, options.trim = POISSON_DEPTH, TRIM
-        pycolmap.poisson_meshing(source, target, options)
-        return Mesh(*ply.read(target))
-
-
-def of_depths(views: Sequence[View], step: int) -> Mesh:
-    """Poisson reconstruction of every `step`-th pixel's depth; normals are those of the depth image."""
-    parts = []
-    for view in views:
-        points, numbers = view.points()
-        whole = torch.full((view.depth.numel(), 3), torch.nan)
-        whole[numbers] = points
-        grid = whole.view(*view.depth.shape, 3)
-        across, down = grid.roll(-1, 1) - grid, grid.roll(-1, 0) - grid
-        normal = torch.nn.functional.normalize(torch.linalg.cross(across, down), dim=-1).view(-1, 3)
-        good = torch.isfinite(normal).all(1) & (torch.arange(len(whole)) % step == 0)
-        parts.append((whole[good], -_away(normal[good], whole[good], view), view.color.view(-1, 3)[good]))
-    positions, directions, colors = (torch.cat(column).numpy() for column in zip(*parts, strict=True))
-    return poisson(positions, directions, colors)
 
 
 def of_sparse_points(cameras_zip: Path) -> Mesh:
@@ -85,7 +51,8 @@ def of_sparse_points(cameras_zip: Path) -> Mesh:
     normals = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near))[1][:, :, 0]
     towards = np.einsum("ni,ni->n", normals, seen_from - points)
     normals *= np.where(towards < 0, -1.0, 1.0)[:, None]
-    return poisson(points, normals, np.array([point.color for point in found]))
+    samples = Samples(torch.from_numpy(points).float(), torch.from_numpy(normals).float())
+    return reconstruct(samples, POISSON_DEPTH)
 
 
 def by_open3d(views: Sequence[View], voxel: float, most: float) -> Mesh:
@@ -116,10 +83,3 @@ def by_open3d(views: Sequence[View], voxel: float, most: float) -> Mesh:
         np.asarray(found.triangles, np.int32),
         (255 * np.asarray(found.vertex_colors)).astype(np.uint8),
     )
-
-
-def _away(normals: torch.Tensor, points: torch.Tensor, view: View) -> torch.Tensor:
-    """The normals [n, 3], turned away from the camera."""
-    center = torch.as_tensor(view.camera.center).to(points)
-    towards = (normals * (center - points)).sum(1, keepdim=True)
-    return torch.where(towards > 0, -normals, normals)

@@ -1,1 +1,1 @@
-"""Meshes of models: depth from many cameras, fused into a signed distance field and written as triangles."""
+"""Meshes of models: depth from many cameras, a surface through the points that they agree on, and its triangles."""

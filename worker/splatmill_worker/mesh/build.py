@@ -1,4 +1,4 @@
-"""A mesh of a model: views, the depths that they agree on, the field, its surface, fewer triangles, colours."""
+"""A mesh of a model: views, the depths that they agree on, the surface through these, fewer triangles, colours."""
 
 from __future__ import annotations
 
@@ -10,14 +10,18 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from splatmill.schema import Progress
 from splatmill_worker.kernels import ops
 from splatmill_worker.mesh.colors import colored
 from splatmill_worker.mesh.depths import View, confirmed, views_of
-from splatmill_worker.mesh.fusion import Corners, Region, fuse
-from splatmill_worker.mesh.surface_nets import extract
+from splatmill_worker.mesh.poisson import levels, reconstruct, side_of
+from splatmill_worker.mesh.samples import Corners, Region, samples_of
 from splatmill_worker.mesh.triangles import Mesh, simplified, without_specks
 from splatmill_worker.scene import Camera
 from splatmill_worker.splat.gaussians import Gaussians
+
+Told = Callable[[Progress], None]
+"""Hears of every view and stage of a mesh, and may raise to stop."""
 
 MOST_VIEWS = 200
 """Cameras that are used; of more, an even choice."""
@@ -27,6 +31,12 @@ MOST_PIXELS = 120_000_000
 
 FOOTPRINT = 1.0
 """Side of a voxel in widths of a pixel at the median depth."""
+
+LEAST = 100
+"""Points of which a surface is made."""
+
+SKIRT = 0.02
+"""How far around a box points still count, in sizes of the box, so that the surface does not end before its sides."""
 
 REACH = 2.0
 """Depth up to which surfaces are built, in median depths of all views."""
@@ -44,7 +54,7 @@ class Wanted:
     """What mesh is asked for.
 
     faces: most triangles.
-    voxel: side of a voxel, world units; None: FOOTPRINT, or larger where the field would grow too large.
+    voxel: largest side of the octree's finest cells, world units; None: FOOTPRINT, or what DEEPEST levels reach.
     box: lower and upper corner of the part of the world that is built; None: all of it within REACH.
     """
 
@@ -60,7 +70,7 @@ class Built:
     mesh: with colours.
     views: number of cameras.
     middle: median depth of all views, world units.
-    voxel: side of a voxel, world units.
+    voxel: side of the octree's finest cells, world units.
     extracted: number of triangles before they were made fewer.
     """
 
@@ -78,15 +88,14 @@ def build(
     *,
     antialias: bool = False,
     backend: ops.Backend | None = None,
-    told: Callable[[str], None] = lambda stage: None,
+    told: Told = lambda progress: None,
     views: list[View] | None = None,
 ) -> Built:
     """The mesh of `gaussians` as `cameras` see them.
 
-    told: hears of every view and stage, and may raise to stop.
     views: receives the views with confirmed depths; where it has some already, those are used.
 
-    Raises NoSurface, and fusion.TooLarge.
+    Raises NoSurface, and poisson.TooFine.
     """
     views = [] if views is None else views
     if not views:
@@ -96,27 +105,27 @@ def build(
             cameras,
             antialias=antialias,
             backend=backend,
-            told=lambda done: told(f"depth of view {done} of {len(cameras)}"),
+            told=lambda done: told(Progress(stage="rendering depths", done=done, total=len(cameras))),
         )
-        told("comparing the depths of neighbouring views")
+        told(Progress(stage="comparing the depths of neighbouring views"))
         views += confirmed(every)
     depths = torch.cat([view.depth[view.depth > 0] for view in views])
     if not len(depths):
         raise NoSurface
     middle = float(depths.median())
-    told("fusing the depths")
     voxel = wanted.voxel or FOOTPRINT * middle / _focal(views)
-    field = fuse(views, voxel, Region(REACH * middle, wanted.box), exact=wanted.voxel is not None)
-    if not len(field.blocks):
+    samples = samples_of(views, Region(REACH * middle, _around(wanted.box)))
+    if len(samples.points) < LEAST:
         raise NoSurface
-    told("extracting the surface")
-    whole = without_specks(_within(extract(field), wanted.box), SPECK)
+    depth = levels(samples, voxel, exact=wanted.voxel is not None)
+    told(Progress(stage="laying a surface through the depths"))
+    whole = without_specks(_within(reconstruct(samples, depth), wanted.box), SPECK)
     if not len(whole.faces):
         raise NoSurface
-    told("simplifying the surface")
+    told(Progress(stage="simplifying the surface"))
     mesh = simplified(whole, wanted.faces)
-    told("colouring the surface")
-    return Built(colored(mesh, views), len(views), middle, field.voxel, len(whole.faces))
+    told(Progress(stage="colouring the surface"))
+    return Built(colored(mesh, views), len(views), middle, side_of(samples, depth), len(whole.faces))
 
 
 def chosen(cameras: Sequence[Camera]) -> list[Camera]:
@@ -132,11 +141,20 @@ def chosen(cameras: Sequence[Camera]) -> list[Camera]:
 
 
 def _within(mesh: Mesh, box: Corners | None) -> Mesh:
-    """The faces of a mesh whose vertices all lie in the box: its blocks reach beyond."""
+    """The faces of a mesh whose vertices all lie in the box."""
     if box is None:
         return mesh
     inside: npt.NDArray[np.bool_] = np.all((mesh.vertices >= box[0]) & (mesh.vertices <= box[1]), axis=1)
     return mesh.only(np.asarray(inside[mesh.faces].all(axis=1)))
+
+
+def _around(box: Corners | None) -> Corners | None:
+    """The box with its SKIRT."""
+    if box is None:
+        return None
+    low, high = np.array(box[0]), np.array(box[1])
+    skirt = SKIRT * float((high - low).max())
+    return tuple(low - skirt), tuple(high + skirt)
 
 
 def _focal(views: Sequence[View]) -> float:

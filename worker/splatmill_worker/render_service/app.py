@@ -33,6 +33,7 @@ from splatmill.schema import (
     ConversionRequest,
     EditModel,
     JoinOrbit,
+    MeshRequest,
     ModelCameras,
     OrbitFrames,
     OrbitRequest,
@@ -41,6 +42,7 @@ from splatmill.schema import (
 )
 from splatmill.schema.headers import write_json
 from splatmill_worker.errors import ModelNotFound, ModelUnreadable
+from splatmill_worker.render_service.mesh_process import MeshMaker, MeshResponse
 from splatmill_worker.render_service.model_cache import LoadedModel, ModelCache
 from splatmill_worker.render_service.render_queue import ClientGone, QueueFull, RenderQueue
 from splatmill_worker.render_service.scratch import ScratchMiddleware, scratch
@@ -91,6 +93,7 @@ class RenderApp:
         self._storage = storage
         self._backend = backend
         self._cache = ModelCache(storage, cache_bytes, backend)
+        self._meshes = MeshMaker(storage, backend)
         self._queue = RenderQueue(MAX_WAITING, MAX_OF_CLIENT, MAX_OF_OWNER, RESERVED)
 
     def asgi(self) -> Starlette:
@@ -104,6 +107,7 @@ class RenderApp:
                 Route(rendering.orbit_join_path("{model_id}"), self.orbit_join, methods=["POST"]),
                 Route(rendering.convert_path("{model_id}"), self.convert, methods=["POST"]),
                 Route(rendering.edits_path("{model_id}"), self.edit, methods=["POST"]),
+                Route(rendering.mesh_path("{model_id}"), self.mesh, methods=["POST"]),
             ],
             middleware=[Middleware(ScratchMiddleware)],
         )
@@ -138,6 +142,10 @@ class RenderApp:
     async def edit(self, request: Request) -> Response:
         """Respond with an edited model."""
         return await self._respond(request, EditModel, self._edited)
+
+    async def mesh(self, request: Request) -> Response:
+        """Respond with lines of progress, and then a mesh."""
+        return await self._respond(request, MeshRequest, self._mesh)
 
     async def _respond(
         self,
@@ -322,6 +330,12 @@ class RenderApp:
         if body.preview:
             return Response(headers=headers)
         return FileResponse(path, media_type="application/octet-stream", headers=headers)
+
+    async def _mesh(
+        self, request: Request, model_id: str, body: MeshRequest, headers: dict[str, str]
+    ) -> Response:
+        lines = self._meshes.lines(model_id, body, scratch(request), request.is_disconnected)
+        return MeshResponse(lines, headers)
 
     def _orbit_cameras(self, model: LoadedModel, body: OrbitRequest) -> list[Camera]:
         from splatmill_worker.render_service.orbit import orbit_cameras

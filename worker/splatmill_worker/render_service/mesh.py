@@ -4,24 +4,30 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 from pydantic import ValidationError
 
+from splatmill.backplane.process import die_with_parent
+from splatmill.backplane.rendering import MeshLine
 from splatmill.backplane.storage.records import reason
-from splatmill.schema import Box, ModelCameras, OrbitRequest
+from splatmill.schema import Box, MeshFacts, ModelCameras, OrbitRequest, Progress
 from splatmill_worker.errors import ModelUnreadable, Refusal
+from splatmill_worker.kernels import ops
 from splatmill_worker.mesh import glb, ply
-from splatmill_worker.mesh.build import Built, NoSurface, Wanted, build
-from splatmill_worker.mesh.fusion import TooLarge
+from splatmill_worker.mesh.build import Built, NoSurface, Told, Wanted, build
+from splatmill_worker.mesh.poisson import TooFine
 from splatmill_worker.mesh.triangles import Mesh
 from splatmill_worker.render_service.encoding import camera_of
 from splatmill_worker.render_service.local import AXES, REFUSED, STOPPED, UNWRITABLE, read
 from splatmill_worker.render_service.orbit import DEFAULT_FOV, UP, Float, cameras_along, path_of
+from splatmill_worker.sandbox import FIRST_TO_DIE
 from splatmill_worker.scene import Camera
 from splatmill_worker.splat.gaussians import Gaussians
 
@@ -31,17 +37,26 @@ RINGS = (-0.2, 0.35, 1.1)
 RING = OrbitRequest(seconds=1.0, fps=24, width=800, height=600)
 """The cameras of one ring: their number and size."""
 
+NICE = 10
+"""By how much the process of a renderer is nicer than that: views that people wait for come first."""
+
 SAY_EVERY = 2.0  # seconds between two lines about the progress
 
 
 def main(chosen: argparse.Namespace) -> int:
     """Run `mesh-file` with its parsed arguments; return the exit status."""
+    if chosen.parent is not None:
+        _serve(chosen.parent)
+    told = _sent if chosen.parent is not None else _Lines().told
     box = None if chosen.box is None else Box.model_validate_json(chosen.box)
     wanted = Wanted(chosen.faces, chosen.voxel, None if box is None else (box.min, box.max))
     try:
-        built = mesh_file(chosen.model, chosen.out, wanted, chosen.cameras, chosen.up)
+        built = mesh_file(chosen.model, chosen.out, wanted, chosen.cameras, chosen.up, chosen.backend, told)
     except (ModelUnreadable, Refusal) as error:
-        print(f"Error: {error.message}", file=sys.stderr)
+        if chosen.parent is not None:
+            print(MeshLine(problem=error.problem()).encoded().decode(), end="", flush=True)
+        else:
+            print(f"Error: {error.message}", file=sys.stderr)
         return REFUSED
     except OSError as error:
         print(f"Error: {error.filename or chosen.out}: {error.strerror or error}.", file=sys.stderr)
@@ -49,6 +64,9 @@ def main(chosen: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         print("Stopped; nothing was written.", file=sys.stderr)
         return STOPPED
+    if chosen.parent is not None:
+        print(MeshLine(facts=facts_of(built)).encoded().decode(), end="", flush=True)
+        return 0
     mesh = built.mesh
     print(
         f"{len(mesh.faces):,} triangles and {len(mesh.vertices):,} vertices from {built.views} views; voxels of "
@@ -58,7 +76,15 @@ def main(chosen: argparse.Namespace) -> int:
     return 0
 
 
-def mesh_file(model: Path, out: Path, wanted: Wanted, cameras: Path | None, up: str) -> Built:
+def mesh_file(
+    model: Path,
+    out: Path,
+    wanted: Wanted,
+    cameras: Path | None,
+    up: str,
+    backend: ops.Backend | None,
+    told: Told,
+) -> Built:
     """Write the mesh of the model file `model` to `out`, a `.glb` or a `.ply`.
 
     cameras: a cameras.json; None takes the one beside the model or, where there is none, rings of cameras around it.
@@ -69,26 +95,32 @@ def mesh_file(model: Path, out: Path, wanted: Wanted, cameras: Path | None, up: 
     contents = read(model)
     path = cameras or model.with_name("cameras.json")
     stored = _stored(path) if cameras is not None or path.is_file() else None
-    every = cameras_for(stored, contents.gaussians, AXES[up])
-    built = built_or_refused(contents.gaussians, every, wanted, bool(contents.antialiased), _Lines().told)
-    write(out, built.mesh, contents.offset)
-    return built
-
-
-def built_or_refused(
-    gaussians: Gaussians, cameras: list[Camera], wanted: Wanted, antialias: bool, told: Callable[[str], None]
-) -> Built:
-    """The mesh of a model. Raises Refusal where the cameras agree on no surface, and where voxels are too small."""
+    gaussians = (
+        contents.gaussians.map(lambda tensor: tensor.cuda()) if backend == "gpu" else contents.gaussians
+    )
+    every = cameras_for(stored, gaussians, AXES[up])
     try:
-        return build(gaussians, cameras, wanted, antialias=antialias, told=told)
+        built = build(
+            gaussians, every, wanted, antialias=bool(contents.antialiased), backend=backend, told=told
+        )
     except NoSurface as error:
         raise Refusal(
             "option_out_of_range",
             "No two cameras agree on a surface of this model. Check that the cameras are those of the model, and that "
             "the box holds a part of it.",
         ) from error
-    except TooLarge as error:
-        raise Refusal("option_out_of_range", f"{error} Choose larger voxels or a box.") from error
+    except TooFine as error:
+        raise Refusal("option_out_of_range", f"{error} Choose larger voxels or a smaller box.") from error
+    write(out, built.mesh, contents.offset)
+    return built
+
+
+def facts_of(built: Built) -> MeshFacts:
+    """What a mesh is made of, as the API says it."""
+    mesh = built.mesh
+    return MeshFacts(
+        triangles=len(mesh.faces), vertices=len(mesh.vertices), views=built.views, voxel=built.voxel
+    )
 
 
 def cameras_for(stored: ModelCameras | None, gaussians: Gaussians, up: Float = UP) -> list[Camera]:
@@ -128,13 +160,26 @@ def _stored(path: Path) -> ModelCameras:
         ) from error
 
 
+def _serve(parent: int) -> None:
+    """Make this process one that a renderer needs least: it ends with it, yields to it, and dies first."""
+    die_with_parent(parent)
+    os.nice(NICE)
+    with suppress(OSError):  # not on every system
+        Path("/proc/self/oom_score_adj").write_text(FIRST_TO_DIE)
+
+
+def _sent(progress: Progress) -> None:
+    print(MeshLine(progress=progress).encoded().decode(), end="", flush=True)
+
+
 class _Lines:
     """Prints what is being done, a line every SAY_EVERY seconds."""
 
     def __init__(self) -> None:
         self._said = time.monotonic()
 
-    def told(self, stage: str) -> None:
+    def told(self, progress: Progress) -> None:
         if time.monotonic() - self._said > SAY_EVERY:
             self._said = time.monotonic()
-            print(stage, flush=True)
+            count = f": {progress.done} of {progress.total}" if progress.total else ""
+            print(f"{progress.stage}{count}", flush=True)

@@ -13,6 +13,7 @@ captures/{id}/imports/{import}.json         record of a file that the server fet
 captures/{id}/sfm/...                       reconstruction, shared by the jobs of the capture
 imports/{capture}.{import}                  mark of an import that has not ended
 orbits/{owner}.{model}.{orbit}              mark of an orbit video that has not ended; owner is a digest
+meshes/{owner}.{model}.{mesh}               mark of a mesh that has not ended
 webhooks/{id}/webhook.json                  record of a webhook, with its secrets
 webhooks/{id}/deliveries/{delivery}.json    one event for this webhook, and the attempts to deliver it
 due/{time}.{webhook}.{delivery}             mark of a delivery that is pending: Unix time of its next attempt
@@ -29,6 +30,8 @@ models/{id}/formats/{format}.json           what the conversion cost and lost; w
 models/{id}/orbits/{orbit}/orbit.json       record of an orbit video, and how many of its frames are stored
 models/{id}/orbits/{orbit}/frames/{n}.mp4   some of its frames, from the n-th on, until the video is whole
 models/{id}/orbits/{orbit}/orbit.mp4        the video
+models/{id}/meshes/{mesh}/mesh.json         record of a mesh
+models/{id}/meshes/{mesh}/mesh              the mesh, in the format of its request
 models/{id}/presentation.json               how the model is shown to people: start view, measurements, annotations
 models/{id}/poster.jpg                      its picture from the start view that was chosen for it
 models/{id}/job.json                        record of the ended job; written last: a model exists once it does
@@ -42,9 +45,15 @@ The id of a model is that of the job that made it.
 """
 
 import re
+from typing import Literal
 
 from splatmill.schema import HELD_OUT, POSTER, TIME_LAPSE, Role
 from splatmill.schema.ids import ID
+
+KeptKind = Literal["orbits", "meshes"]
+"""The kinds of what is made of a model in the background and kept with it: the names of their folders."""
+
+_RECORDS: dict[KeptKind, str] = {"orbits": "orbit.json", "meshes": "mesh.json"}
 
 MODEL_FILES = {
     "model.ply": "application/octet-stream",
@@ -97,13 +106,14 @@ def folder_of(path: str) -> tuple[str, str, str] | None:
 
 def is_derived(kind: str, inside: str) -> bool:
     """Return whether a path inside of a folder can be made again: a capture's reconstruction and manifest, a job's work
-    files, or a model's conversions to other formats and orbit videos."""
+    files, or a model's conversions to other formats, orbit videos and meshes."""
     return (kind, inside.partition("/")[0]) in (
         ("captures", "sfm"),
         ("captures", MANIFEST),
         ("jobs", "work"),
         ("models", "formats"),
         ("models", "orbits"),
+        ("models", "meshes"),
     )
 
 
@@ -275,17 +285,28 @@ def conversion_record(model_id: str, key: str) -> str:
     return f"models/{model_id}/formats/{key}.json"
 
 
-def model_orbits(model_id: str) -> str:
-    """Return the folder of the orbit videos of a model."""
-    return f"models/{model_id}/orbits"
+def kept_of(model_id: str, kind: KeptKind) -> str:
+    """Return the folder of what is made of a model in the background and kept with it: of one kind."""
+    return f"models/{model_id}/{kind}"
 
 
-def orbit(model_id: str, orbit_id: str) -> str:
-    return f"models/{model_id}/orbits/{orbit_id}"
+def kept(model_id: str, kind: KeptKind, kept_id: str) -> str:
+    return f"models/{model_id}/{kind}/{kept_id}"
 
 
-def orbit_record(model_id: str, orbit_id: str) -> str:
-    return f"models/{model_id}/orbits/{orbit_id}/orbit.json"
+def kept_record(model_id: str, kind: KeptKind, kept_id: str) -> str:
+    """Return the path of the record of an orbit video or a mesh. Only the server writes it."""
+    return f"models/{model_id}/{kind}/{kept_id}/{_RECORDS[kind]}"
+
+
+def unfinished_kept(kind: KeptKind) -> str:
+    """Return the folder of the marks of all orbit videos, or all meshes, that have not ended."""
+    return kind
+
+
+def unfinished_mark(kind: KeptKind, owner: str, model_id: str, kept_id: str) -> str:
+    """Return the path of the mark of one that has not ended; `owner` is a digest, since owners may have any name."""
+    return f"{kind}/{owner}.{model_id}.{kept_id}"
 
 
 def orbit_video(model_id: str, orbit_id: str) -> str:
@@ -298,14 +319,8 @@ def orbit_frames(model_id: str, orbit_id: str, first: int | None = None) -> str:
     return folder if first is None else f"{folder}/{first:06d}.mp4"
 
 
-def unfinished_orbits() -> str:
-    """Return the folder of the marks of all orbit videos that have not ended."""
-    return "orbits"
-
-
-def unfinished_orbit(owner: str, model_id: str, orbit_id: str) -> str:
-    """Return the path of the mark of an orbit video; `owner` is a digest, since owners may have any name."""
-    return f"orbits/{owner}.{model_id}.{orbit_id}"
+def mesh_file(model_id: str, mesh_id: str) -> str:
+    return f"models/{model_id}/meshes/{mesh_id}/mesh"
 
 
 def job_record(job_id: str) -> str:

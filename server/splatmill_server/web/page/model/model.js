@@ -1,4 +1,4 @@
-// The page of one model: the viewer with its tools, the comparison with held-out photos, downloads, orbit video, cameras.
+// The page of one model: the viewer with its tools, the comparison with held-out photos, downloads, orbit video, mesh, cameras.
 
 import { at } from "../address.js";
 import { Problem, get, idOfPage, modelAddress, request } from "../api.js";
@@ -7,6 +7,7 @@ import { ago, bytes } from "../format.js";
 import { showCompare } from "./compare.js";
 import { showCameras } from "./cameras.js";
 import { showDownloads } from "./downloads.js";
+import { showMesh } from "./mesh.js";
 import { showOrbit } from "./orbit.js";
 import { Stage } from "./stage.js";
 import { binned } from "../bin.js";
@@ -61,6 +62,7 @@ async function show(shown) {
   void showDownloads(byId("downloads"), shown);
   const stage = new Stage(shown);
   void showOrbit(byId("orbit"), shown, stage);
+  void showMesh(byId("mesh"), shown, stage);
   showCameras(byId("cameras"), shown, stage);
   document.addEventListener("visibilitychange", () => {
     if (!document.hidden) void lookWhere(shown);

@@ -4,6 +4,7 @@ import { get, request, send } from "../api.js";
 import { h } from "../dom.js";
 import { bytes } from "../format.js";
 import { noticeOf } from "../shell.js";
+import { follow } from "./kept.js";
 
 /**
  * @import {Shown} from "./model.js"
@@ -13,9 +14,6 @@ import { noticeOf } from "../shell.js";
 const SIZES = {
   "640 x 480": [640, 480], "960 x 720": [960, 720], "1280 x 720": [1280, 720], "1920 x 1080": [1920, 1080], "1080 x 1920": [1080, 1920],
 };
-
-/** Milliseconds between two looks how far a video is. */
-const LOOK_MS = 500;
 
 /**
  * @param {HTMLElement} section
@@ -50,7 +48,7 @@ export async function showOrbit(section, { model, address, background }, stage) 
     }
     make.disabled = true;
     try {
-      await follow(await send("POST", `${address}/orbits`, { seconds: Number(length.value), width, height, background, ...(path ? { camera_path: path } : {}) }));
+      await show(await send("POST", `${address}/orbits`, { seconds: Number(length.value), width, height, background, ...(path ? { camera_path: path } : {}) }));
     } catch (error) {
       place.append(noticeOf(/** @type {Error} */ (error)));
     } finally {
@@ -58,39 +56,27 @@ export async function showOrbit(section, { model, address, background }, stage) 
     }
   }
 
-  /** Show how far a video is until it is whole, and then the video. @param {any} orbit */
-  async function follow(orbit) {
-    const stopping = new AbortController();
-    stop.onclick = async () => {
-      stopping.abort(); // a question under way could come after the deletion
-      try {
-        await request("DELETE", orbit.links.self);
-      } catch (error) {
-        place.append(noticeOf(/** @type {Error} */ (error)));
-      }
-    };
+  /** Show how far a video is until it is whole, and then the video. @param {any} begun */
+  async function show(begun) {
     make.disabled = true;
-    stop.hidden = bar.hidden = false;
+    bar.hidden = false;
     try {
-      while (!stopping.signal.aborted && !["succeeded", "failed"].includes(orbit.state)) {
-        bar.max = orbit.frames;
-        bar.value = orbit.frames_done;
-        state.textContent = `${orbit.frames_done} of ${orbit.frames} frames are rendered. The server continues if this page is closed.`;
-        await new Promise((resolve) => setTimeout(resolve, LOOK_MS));
-        if (!stopping.signal.aborted) orbit = await get(orbit.links.self, {}, stopping.signal);
-      }
-      const stopped = stopping.signal.aborted;
-      state.textContent = stopped ? "Stopped." : orbit.state === "failed" ? orbit.problem.detail : "";
-      if (!stopped && orbit.state === "succeeded") {
+      const orbit = await follow(begun, stop, ({ frames, frames_done }) => {
+        bar.max = frames;
+        bar.value = frames_done;
+        state.textContent = `${frames_done} of ${frames} frames are rendered. The server continues if this page is closed.`;
+      }, (error) => place.append(noticeOf(error)));
+      state.textContent = !orbit ? "Stopped." : orbit.state === "failed" ? orbit.problem.detail : "";
+      if (orbit?.state === "succeeded") {
         play(orbit);
         await list();
       }
     } catch (error) {
-      state.textContent = stopping.signal.aborted ? "Stopped." : "";
-      if (!stopping.signal.aborted) throw error;
+      state.textContent = "";
+      throw error;
     } finally {
       make.disabled = false;
-      stop.hidden = bar.hidden = true;
+      bar.hidden = true;
     }
   }
 
@@ -135,7 +121,7 @@ export async function showOrbit(section, { model, address, background }, stage) 
     h("div", { class: "row" }, make, stop), bar, state, place, kept);
   try {
     const [unfinished] = await list();
-    if (unfinished) await follow(unfinished);
+    if (unfinished) await show(unfinished);
   } catch (error) {
     place.append(noticeOf(/** @type {Error} */ (error)));
   }
