@@ -30,6 +30,7 @@ from splatmill_server.base.settings import Settings
 from splatmill_server.web import pages
 from tests.support.path_proxy import path_proxy
 from tests.support.served_app import Serve, ServedApp, problem
+from tests.support.waiting import wait_for
 
 PUBLISHED = [
     pytest.param({"root_path": "/splats"}, {"strip": True}, id="stripped"),
@@ -245,6 +246,9 @@ def test_the_log_shows_no_token(serve: Serve) -> None:
     structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.INFO))
     with structlog.testing.capture_logs() as lines:
         app.http.get("/splats/s/a-secret-token/model")
+        wait_for(
+            lambda: any(line["event"] == "request" for line in lines)
+        )  # it is written after the response
     paths = [line["path"] for line in lines if line["event"] == "request"]
     assert paths == ["/s/.../model"]
 

@@ -1,11 +1,13 @@
 """Proves which photos are taken for panoramas: by their XMP, by their shape and edges, and by the photos beside them;
-that cropped photos and cut-outs of the same shape are not; and the sentences about each.
+that cropped photos and cut-outs of the same shape are not; and the sentences about each. A tripod
+below is masked.
 
 Does not prove how they are trained: test_faces.py does, and tests/worker/sfm/test_panoramas.py.
 """
 
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 from PIL import Image
@@ -13,7 +15,8 @@ from PIL import Image
 from splatmill_worker.images import panoramas
 from splatmill_worker.images.panoramas import Candidate, Sphere, decided
 from splatmill_worker.images.prepare import Prepared, prepare
-from tests.support.panoramas import gpano, striped
+from tests.support.panoramas import gpano, striped, walk, write
+from tests.support.spherical_video import call_spherical
 
 
 def prepared(folder: Path) -> Prepared:
@@ -88,6 +91,51 @@ def test_panoramas_by_their_edges_are_said_and_others_of_the_shape_stay_photos(t
     assert "ordinary lens" in warning
 
 
+@pytest.mark.parametrize("is_called", [True, False])
+def test_frames_of_a_360_degree_video_are_panoramas(tmp_path: Path, is_called: bool) -> None:
+    """By the metadata of the video, of which the frames show nothing; without it, they are photos."""
+    (tmp_path / "images").mkdir()
+    path = tmp_path / "images/walk.mp4"
+    random = np.random.default_rng(0)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 128, 64, "yuv420p"
+        for _ in range(20):
+            frame = Image.fromarray(random.integers(0, 256, (8, 16, 3), np.uint8)).resize((128, 64))
+            container.mux(stream.encode(av.VideoFrame.from_image(frame)))
+        container.mux(stream.encode())
+    if is_called:
+        call_spherical(path)
+    found = prepared(tmp_path / "images")
+    assert len(found.photos) > 3
+    assert {photo.is_panorama for photo in found.photos} == {is_called}
+
+
+@pytest.mark.slow
+def test_the_tripod_below_is_masked_and_nothing_in_panoramas_without_one(tmp_path: Path) -> None:
+    plain = tmp_path / "plain"
+    write(plain, walk(12), 256, samples=1)
+    assert prepared(plain).overlays == ()
+    noise = np.random.default_rng(3).integers(0, 256, (16, 32, 3), np.uint8)
+    legs = np.asarray(Image.fromarray(noise).resize((256, 128), Image.Resampling.BICUBIC))
+    latitude = 90 - 180 * (np.arange(128) + 0.5) / 128
+    hidden = latitude[:, None] < -68 + 12 * np.cos(4 * np.pi * np.arange(256) / 256)
+    (tmp_path / "images").mkdir()
+    for path in plain.iterdir():
+        with Image.open(path) as image:
+            pixels = np.where(hidden[:, :, None], legs, np.asarray(image))
+        Image.fromarray(pixels).save(
+            tmp_path / "images" / path.name, quality=92, xmp=gpano(ProjectionType="equirectangular")
+        )
+    found = prepared(tmp_path / "images")
+    assert all(photo.is_panorama and photo.mask is not None for photo in found.photos)
+    ((shown,), (warning,)) = found.overlays, found.warnings
+    assert "at the bottom, never changes in 12 photos" in warning
+    region = np.asarray(Image.fromarray(shown.region).resize((256, 128)))
+    assert region[hidden].mean() > 0.98
+    assert (region & ~hidden).sum() < 0.4 * hidden.sum()  # what surrounds it by a few pixels of 160
+
+
 def candidates(*spheres: Sphere, is_frame: bool = False) -> list[Candidate]:
     return [Candidate(f"{i}", 64, 32, "a", is_frame, sphere) for i, sphere in enumerate(spheres)]
 
@@ -96,7 +144,8 @@ def candidates(*spheres: Sphere, is_frame: bool = False) -> list[Candidate]:
     ("spheres", "expected"),
     [
         (("unclear", "closed"), [True, True]),
-        (("unclear", "stated", "stated", ""), [True, True, True, False]),
+        (("unclear", "stated", "stated", ""), [True, True, True, True]),
+        (("closed", "", ""), [True, False, False]),
         (("unclear", "", ""), [False, False, False]),
         (("unclear", "unclear", "unclear", "closed"), [False, False, False, True]),
     ],

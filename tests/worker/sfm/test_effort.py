@@ -186,7 +186,7 @@ def test_no_higher_effort_is_tried_where_there_is_no_time_for_it(
     monkeypatch.setattr(solve, "solve_at", solve_at)
     monkeypatch.setattr(solve, "registered_counts", lambda _: (registered, registered))
     monkeypatch.setattr(solve, "unfold", lambda *_: None)
-    prepared: Any = SimpleNamespace(photos=[SimpleNamespace(width=640, height=480)] * 10)
+    prepared: Any = SimpleNamespace(photos=[SimpleNamespace(width=640, height=480, is_panorama=False)] * 10)
     asked = sfm.SfmOptions(seconds=40.0)
     with ThreadPoolExecutor(1) as pool:
         run = SfmRun(prepared, [], "SIMPLE_RADIAL", asked, tmp_path, 1, pool, lambda *_: None, lambda: False)

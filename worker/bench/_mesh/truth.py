@@ -42,7 +42,8 @@ def scores(mesh: Mesh, truth: Float, life: StillLife) -> dict[str, float]:
     samples = samples[within(samples)]
     found: dict[str, float] = {}
     if not len(samples):
-        return {"chamfer": math.inf} | {f"f_{share:g}": 0.0 for share in SHARES}
+        names = ("precision", "completeness", "f")
+        return {"chamfer": math.inf} | {f"{name}_{share:g}": 0.0 for name in names for share in SHARES}
     to_truth = distances(samples, life.solids)
     to_mesh = cKDTree(samples).query(truth)[0]
     found["chamfer"] = float(to_truth.mean() + to_mesh.mean()) / 2

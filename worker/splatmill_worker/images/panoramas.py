@@ -121,7 +121,7 @@ class Candidate:
 def decided(photos: Sequence[Candidate]) -> tuple[list[bool], list[str]]:
     """Whether each photo is a panorama, and sentences for the user on what was assumed.
 
-    What the edges leave unclear is decided by the photos of the same size and folder, of which at least half are
+    What the edges do not say is decided by the photos of the same size and folder, of which at least half are
     panoramas or are not; and so are all frames of a video.
     """
     keys = [(each.source, each.width, each.height) for each in photos]
@@ -132,7 +132,7 @@ def decided(photos: Sequence[Candidate]) -> tuple[list[bool], list[str]]:
     chosen, assumed, doubtful = [], [], []
     for key, each in zip(keys, photos, strict=True):
         most = 2 * certain[key] >= counts[key] and certain[key] > 0
-        follows = each.sphere == "unclear" or (each.is_frame and each.sphere != "stated")
+        follows = each.sphere in ("unclear", "") or (each.is_frame and each.sphere != "stated")
         is_panorama = most if follows else each.sphere in ("stated", "closed")
         chosen.append(is_panorama)
         if is_panorama and each.sphere != "stated":

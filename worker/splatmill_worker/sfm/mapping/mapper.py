@@ -139,10 +139,11 @@ class _Steps:
         self._placed = 0
 
     def __call__(self, model: pycolmap.Reconstruction, next_step: str) -> None:
-        # Further models begin with two photos; the progress is that of the largest.
-        self._placed = max(self._placed, model.num_reg_images())
+        # Many first pairs are tried, and further models begin with one: the largest model of more than a pair is shown.
+        if largest := model.num_reg_images() >= self._placed:
+            self._placed = model.num_reg_images()
         self._on_progress(self._placed, self._count, next_step or "photos placed")
-        if model.num_reg_images() > 0:
+        if largest and self._placed > 2:
             self._on_model(model)
 
 
