@@ -61,8 +61,22 @@ def plan_training(job: Job, cameras: Cameras, revise: Revise, stages: Stages) ->
         if job.options.within is not None:
             facts = replace(facts, seconds_left=job.options.within - stages.elapsed)
         plan = _make_plan(job, facts, revise)
+        if (late := overrun(facts, plan)) is not None:
+            job.warn(late)
     smaller = plan.image_size < max(facts.width, facts.height)
     return Planned(first, facts, plan, None if smaller else _in_light(photos, facts, plan), room)
+
+
+def overrun(facts: Facts, plan: Plan) -> str | None:
+    """A sentence where the training alone takes more than what the job has left of its time; None where it does not."""
+    seconds = plan.schedule.budget.seconds
+    if facts.seconds_left is None or seconds is None or seconds <= facts.seconds_left:
+        return None
+    return (
+        f"The cameras have left {max(0.0, facts.seconds_left):.0f} s of the time for the whole job. Training takes "
+        f"{seconds:.0f} s, to show each photo once, so that the job ends later than asked and its model is blurred. "
+        "Give it more time for a sharper one: the cameras are kept."
+    )
 
 
 def planned_photos(cameras: Cameras, planned: Planned, stages: Stages) -> Photos:

@@ -5,6 +5,7 @@ Does not prove that a job ends in its time: what storing takes is assumed. The b
 
 import pytest
 
+from splatmill_worker.pipeline.planning import overrun
 from splatmill_worker.splat.plan.deadline import (
     COMPARED_STEPS,
     EVALUATED_STEPS,
@@ -48,3 +49,13 @@ def test_lpips_is_left_out_and_nothing_is_doubled() -> None:
     plan = planned(changed(seconds_left=100.0), within="2m")
     assert not plan.lpips
     assert plan.schedule.longest is None
+
+
+def test_a_job_that_ends_later_than_asked_says_so() -> None:
+    facts = changed(seconds_left=0.1)
+    late = overrun(facts, planned(facts, within="1m"))
+    assert late is not None
+    assert "left 0 s of the time for the whole job" in late
+    enough = changed(seconds_left=50.0)
+    assert overrun(enough, planned(enough, within="1m")) is None
+    assert overrun(changed(), planned(steps=500)) is None
