@@ -16,7 +16,7 @@ from playwright.sync_api import Locator, Page, expect
 from tests.browser.test_new import give, opened
 from tests.support.paths import DATA
 
-CAPTURES = ("kermit_640x480/images", "room_464/images", "failure_pure_rotation/images")
+CAPTURES = ("kermit_640x480/images", "failure_pure_rotation/images")
 SIDE = 480
 """Pixels of the longer side at which photos are given, so that they are examined soon; thumbnails are smaller."""
 
@@ -50,8 +50,7 @@ def warnings(page: Page, photos: list[Path]) -> Locator:
 @pytest.mark.parametrize("capture", CAPTURES)
 def test_real_captures_get_no_warning(page: Page, tmp_path: Path, capture: str) -> None:
     photos = photos_of(capture)
-    # Over 48, they are compared in runs.
-    said = warnings(page, small(tmp_path, photos[:52]))
+    said = warnings(page, small(tmp_path, photos))
     expect(said).to_have_count(0)
 
 
