@@ -32,6 +32,7 @@ from _train import bare
 from splatmill.schema import Event, ModelCameras, TrainOptions
 from splatmill_worker import pipeline
 from splatmill_worker.mesh.build import Wanted, build
+from splatmill_worker.mesh.colors import colored
 from splatmill_worker.mesh.depths import View
 from splatmill_worker.mesh.samples import Region
 from splatmill_worker.mesh.triangles import Mesh, simplified
@@ -78,7 +79,9 @@ def measured(options: argparse.Namespace) -> Iterator[Row | str]:
         ),
         "Open3D's fusion of the same depths": lambda: others.by_open3d(near, PIXEL, 2 * built.middle),
     }
-    methods[f"Splatmill, {FACES[1]:,} triangles at most"] = lambda: simplified(built.mesh, FACES[1])
+    methods[f"Splatmill, {FACES[1]:,} triangles at most"] = lambda: colored(
+        simplified(built.mesh, FACES[1]), views
+    )
     for name, made in methods.items():
         began = time.process_time()
         try:

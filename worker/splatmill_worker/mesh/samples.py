@@ -13,8 +13,8 @@ from splatmill_worker.mesh.depths import GRAZING, View
 Corners = tuple[tuple[float, float, float], tuple[float, float, float]]
 """The lower and the upper corner of a box."""
 
-MOST = 2_000_000
-"""Points of a mesh at most: of more pixels, a random choice. They decide the memory of the reconstruction."""
+MOST = 700_000
+"""Points of a mesh at most: of more pixels, a random choice. They decide its seconds and memory (decisions: NEAR)."""
 
 _MIXER = 2654435761
 """Knuth's multiplier: pixels are chosen by the product of their number with it, so that they form no pattern."""

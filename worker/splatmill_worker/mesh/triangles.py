@@ -65,14 +65,17 @@ def without_specks(mesh: Mesh, share: float) -> Mesh:
 
 
 def simplified(mesh: Mesh, faces: int) -> Mesh:
-    """The mesh with about `faces` triangles, by quadric error (Garland & Heckbert 1997); as it is if it has no more."""
+    """The mesh with about `faces` triangles, by quadric error (Garland & Heckbert 1997); as it is if it has no more.
+
+    The fewer ones have no colours: COLMAP writes none.
+    """
     if len(mesh.faces) <= faces:
         return mesh
     from splatmill_worker.colmap import pycolmap  # not before a mesh is simplified
 
     with tempfile.TemporaryDirectory(prefix="splatmill-mesh-") as folder:
         source, target = Path(folder) / "all.ply", Path(folder) / "fewer.ply"
-        ply.write(source, mesh.vertices, mesh.faces, mesh.colors)
+        ply.write(source, mesh.vertices, mesh.faces, None)
         options = pycolmap.MeshSimplificationOptions()
         options.target_face_ratio = faces / len(mesh.faces)
         pycolmap.simplify_mesh(source, target, options)
