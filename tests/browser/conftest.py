@@ -105,7 +105,7 @@ def _train(folder: Path) -> None:
 
 
 @pytest.fixture(scope="session")
-def service(trained: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Up]:
+def lasting_service(trained: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Up]:
     """`splatmill up` with the real worker and renderer, without keys, on a copy of what `trained` holds."""
     data = tmp_path_factory.mktemp("up") / "data"
     shutil.copytree(trained / "data", data, ignore=shutil.ignore_patterns("*.sock"))
@@ -114,8 +114,26 @@ def service(trained: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator
     up.close()
 
 
+@pytest.fixture(scope="module")
+def service(lasting_service: Up) -> Iterator[Up]:
+    """The service of this test process. What a file of tests makes is deleted after it: lists begin alike for all."""
+    before = {kind: _ids(lasting_service, kind) for kind in ("jobs", "captures")}
+    yield lasting_service
+    for kind, ids in before.items():
+        for made in _ids(lasting_service, kind) - ids:
+            if kind == "jobs":
+                lasting_service.http.post(f"/v1/jobs/{made}/cancel")  # 409 if it has ended
+                lasting_service.ended(made, 60)
+            assert lasting_service.http.delete(f"/v1/{kind}/{made}").status_code == 204
+
+
+def _ids(up: Up, kind: str) -> set[str]:
+    """The ids of all jobs or captures, of which there are fewer than a page holds."""
+    return {record["id"] for record in up.http.get(f"/v1/{kind}").json()[kind]}
+
+
 @pytest.fixture(scope="session")
-def model(service: Up, trained: Path) -> SmallModel:
+def model(lasting_service: Up, trained: Path) -> SmallModel:
     """The model that the service holds."""
     return SmallModel(**json.loads((trained / "model.json").read_text()))
 

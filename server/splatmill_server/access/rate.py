@@ -46,7 +46,8 @@ class Rate:
             return
         taking = cast(Any, self._take(keys=[keys.rate(caller.key_id)], args=[limit]))
         try:
-            wait = await asyncio.wait_for(taking, WAIT_SECONDS)
+            async with asyncio.timeout(WAIT_SECONDS):
+                wait = await taking
         except (redis.RedisError, TimeoutError) as error:
             log.warning("the rate of requests is not limited", error=type(error).__name__)
             return

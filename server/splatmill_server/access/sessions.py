@@ -65,6 +65,7 @@ class Sessions:
 
     async def _reply(self, pending: Awaitable[T] | Any) -> Any:
         try:
-            return await asyncio.wait_for(pending, self._timeout)
+            async with asyncio.timeout(self._timeout):
+                return await pending
         except TimeoutError as error:
             raise redis.TimeoutError("Redis did not answer in time.") from error

@@ -119,7 +119,8 @@ class Deliveries:
                     log.exception("deliveries cannot be looked for")
                 pause = min(_LOOK_SECONDS, max(0.0, self._due_at - time.time()))
                 with suppress(TimeoutError):
-                    await asyncio.wait_for(self._wake.wait(), pause)
+                    async with asyncio.timeout(pause):
+                        await self._wake.wait()
         finally:
             tasks = list(self._running.values())
             for task in tasks:

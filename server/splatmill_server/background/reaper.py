@@ -70,7 +70,8 @@ class Reaper:
             except Exception:
                 log.exception("reaper tick failed")
             try:
-                await asyncio.wait_for(self._wake.wait(), self.pause)
+                async with asyncio.timeout(self.pause):
+                    await self._wake.wait()
             except TimeoutError:
                 continue
             self._wake.clear()

@@ -95,7 +95,8 @@ class Subscription:
         """Return the next batch, or None if there is none after this time. Raises redis.RedisError."""
         if not self._batches and self._error is None:
             with suppress(TimeoutError):
-                await asyncio.wait_for(self._came.wait(), seconds)
+                async with asyncio.timeout(seconds):
+                    await self._came.wait()
         self._came.clear()
         if self._error is not None:
             raise self._error

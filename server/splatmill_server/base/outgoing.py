@@ -128,9 +128,8 @@ class Outgoing:
         """Resolve a name. Raises AddressRefused if any of its addresses is not public, and NoAnswer if it has none."""
         loop = asyncio.get_running_loop()
         try:
-            answers = await asyncio.wait_for(
-                loop.getaddrinfo(host, port, type=socket.SOCK_STREAM), CONNECT_SECONDS
-            )
+            async with asyncio.timeout(CONNECT_SECONDS):
+                answers = await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM)
         except TimeoutError as error:
             raise NoAnswer(
                 f"The name {host} was not resolved within {CONNECT_SECONDS:.0f} seconds."

@@ -106,7 +106,8 @@ class Unfinished:
                 except Exception:
                     log.exception("unfinished work cannot be looked for", kind=self._kind)
                 with suppress(TimeoutError):
-                    await asyncio.wait_for(self._wake.wait(), self._look_seconds)
+                    async with asyncio.timeout(self._look_seconds):
+                        await self._wake.wait()
         finally:
             tasks = list(self.running.values())
             for task in tasks:
