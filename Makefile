@@ -21,7 +21,7 @@ REDIS ?= $(shell command -v redis-server valkey-server | head -n 1)
 # Bytecode is kept, whatever the shell asks for: the tests start hundreds of processes, and each would compile its imports again.
 PYTEST := env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
-.PHONY: FORCE help install demo quick test redis fresh coverage check mutants wheels docs screenshots pictures bench soak capacity fleet load abuse fuzz serve sanitize clean
+.PHONY: FORCE help install demo quick test redis fresh coverage check mutants wheels docs screenshots walk pictures bench soak capacity fleet load abuse fuzz serve sanitize clean
 
 help: ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -71,6 +71,9 @@ docs: $(VENV)/.installed-dev ## build the documentation into docs/build/html, wi
 
 screenshots: $(VENV)/.installed-dev ## make the documentation's pictures of the web page (needs a browser; some minutes)
 	$(BIN)/python docs/screenshots.py
+
+walk: $(VENV)/.installed-dev ## walk the pages as a new user, at three sizes and in two themes; pictures in demo/walk (some minutes)
+	PYTHONPATH=server $(BIN)/python -m tests.support.first_hour demo/walk
 
 pictures: $(VENV)/.installed ## make the documentation's pictures of what photos do to a model (some minutes)
 	$(BIN)/python docs/pictures.py

@@ -6,6 +6,7 @@ Not proved here: what phones warn of, and a network with several machines in it.
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import ssl
@@ -16,6 +17,7 @@ from pathlib import Path
 
 import httpx
 import pytest
+from PIL import Image
 from playwright.sync_api import expect
 
 from splatmill_server.base.tls import fingerprint
@@ -24,6 +26,7 @@ from splatmill_server.up.certificate import certificate
 from splatmill_server.up.folder import UpError
 from tests.browser.conftest import Open
 from tests.browser.test_new_phone import WEB
+from tests.support.axe import violations
 from tests.support.programs import node
 from tests.support.up import Up
 
@@ -46,6 +49,19 @@ def up(address: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Up]:
 
 def key_of(up: Up) -> str:
     return (up.data / "lan" / "key").read_text().strip()
+
+
+def read_code(picture: Image.Image, folder: Path) -> str:
+    """The text of a QR code in a picture."""
+    (folder / "pixels").write_bytes(picture.tobytes())
+    program = f"""
+        import decodeQR from "qr/decode.js"; import fs from "node:fs";
+        const data = new Uint8Array(fs.readFileSync({json.dumps(str(folder / "pixels"))}));
+        console.log(decodeQR({{ width: {picture.width}, height: {picture.height}, data }}));"""
+    command = [*node("qr"), "--input-type=module", "-e", program]
+    done = subprocess.run(command, cwd=WEB, capture_output=True, text=True, timeout=60)
+    assert done.stdout, done.stderr
+    return done.stdout.strip()
 
 
 def test_other_devices_need_https_the_certificate_and_the_key(up: Up, address: str) -> None:
@@ -84,7 +100,7 @@ def test_the_code_of_the_terminal_signs_a_phone_in(up: Up, open_window: Open) ->
 
 
 def test_the_page_of_the_machine_itself_shows_the_code_for_phones(
-    up: Up, open_window: Open, address: str
+    up: Up, open_window: Open, address: str, tmp_path: Path
 ) -> None:
     port = up.http.base_url.port
     visit = open_window(f"https://127.0.0.1:{port}", ignore_https_errors=True)
@@ -95,7 +111,28 @@ def test_the_page_of_the_machine_itself_shows_the_code_for_phones(
     page.get_by_text("Take the photos with a phone").click()
     expect(page.get_by_role("img", name=f"QR code of https://{address}:{port}/")).to_be_visible()
     expect(page.locator("#phone-help")).to_contain_text(fingerprint(up.data / "lan" / "certificate.pem"))
-    expect(page.locator("#phone-help")).to_contain_text("will ask for the API key")
+    expect(page.locator("#phone-help")).to_contain_text("will ask for an API key")
+    expect(page.locator("#phone-help")).not_to_contain_text(key_of(up))
+    page.get_by_role("button", name="Show the key").focus()
+    page.keyboard.press("Enter")
+    expect(page.locator("#phone-help")).to_contain_text(f"API key: {key_of(up)}")
+    expect(page.locator("#phone-help")).to_contain_text("can use all of the service")
+    picture = Image.open(io.BytesIO(page.get_by_role("img", name="signs a phone in").screenshot())).convert(
+        "RGBA"
+    )
+    assert read_code(picture, tmp_path) == f"https://{address}:{port}/sign-in#key={key_of(up)}"
+    assert not violations(page)
+
+
+def test_only_an_admin_is_shown_the_key(up: Up) -> None:
+    owner = {"Authorization": f"Bearer {key_of(up)}"}
+    answer = up.http.get("/v1/lan", headers=owner)
+    assert (answer.json()["key"], answer.headers["cache-control"]) == (key_of(up), "no-store")
+    body = {"name": "phone", "owner": "mum", "scopes": ["train"]}
+    made = up.http.post("/v1/keys", json=body, headers=owner).json()
+    for headers, status in (({}, 401), ({"Authorization": f"Bearer {made['secret']}"}, 403)):
+        assert up.http.get("/v1/lan", headers=headers).status_code == status
+    up.http.delete(f"/v1/keys/{made['id']}", headers=owner)
 
 
 def test_the_operator_sees_what_is_open_and_the_code(up: Up, address: str, tmp_path: Path) -> None:
@@ -117,19 +154,8 @@ def test_the_operator_sees_what_is_open_and_the_code(up: Up, address: str, tmp_p
         for y in range(scale * len(rows))
     ]
     pixels = bytes(value for row in light for level in row for value in (level, level, level, 255))
-    (tmp_path / "pixels").write_bytes(pixels)
-    program = f"""
-        import decodeQR from "qr/decode.js"; import fs from "node:fs";
-        const data = new Uint8Array(fs.readFileSync({json.dumps(str(tmp_path / "pixels"))}));
-        console.log(decodeQR({{ width: {len(light[0])}, height: {len(light)}, data }}));"""
-    done = subprocess.run(
-        [*node("qr"), "--input-type=module", "-e", program],
-        cwd=WEB,
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
-    assert done.stdout.strip() == f"https://{address}:8080/sign-in#key={key_of(up)}", done.stderr
+    picture = Image.frombytes("RGBA", (len(light[0]), len(light)), pixels)
+    assert read_code(picture, tmp_path) == f"https://{address}:8080/sign-in#key={key_of(up)}"
 
 
 def test_key_and_certificate_are_kept_while_they_serve(up: Up, tmp_path: Path) -> None:

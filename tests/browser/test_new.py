@@ -488,6 +488,25 @@ def test_digests_are_right_without_the_browsers_own(page: Page) -> None:
     assert page.evaluate(script, size) == [expected, expected]
 
 
+def test_a_scene_is_called_as_its_folder_or_its_day_until_somebody_names_it(
+    page: Page, photos: Path, tmp_path: Path
+) -> None:
+    some = sorted(photos.iterdir())[:3]
+    (tmp_path / "Großer Garten").mkdir()
+    for path in some:
+        shutil.copy(path, tmp_path / "Großer Garten")
+    opened(page)
+    give(page, tmp_path / "Großer Garten")
+    name = page.get_by_label("Name", exact=True)
+    expect(name).to_have_value("Großer Garten")
+    page.get_by_role("button", name="Remove all").click()
+    give(page, *some)
+    expect(name).to_have_value(re.compile(r"^[A-Z][a-z]+ \d{1,2}, \d{4}$"))
+    name.fill("mine")
+    give(page, tmp_path / "Großer Garten")
+    expect(name).to_have_value("mine")
+
+
 def test_empty_lists_leave_no_gap_above_the_photos(page: Page, photos: Path) -> None:
     give(opened(page), *sorted(photos.iterdir()))
     page.evaluate("document.getElementById('remarks').replaceChildren()")

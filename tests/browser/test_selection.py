@@ -90,7 +90,13 @@ def test_a_lasso_is_tinted_and_is_what_the_server_leaves_out(
 ) -> None:
     panel.get_by_label("Keep only what lies in the box").uncheck()
     whole = picture(page)
-    panel.get_by_role("button", name="Lasso").click()
+    lasso = panel.get_by_role("button", name="Lasso")
+    plain = lasso.evaluate("button => getComputedStyle(button).backgroundColor")
+    lasso.click()
+    page.mouse.move(1, 1)
+    assert lasso.evaluate("button => getComputedStyle(button).backgroundColor") != plain, (
+        "it is seen to be on"
+    )
     draw(page, *AROUND)
     chosen = count(panel)
     page.mouse.move(1, 1)

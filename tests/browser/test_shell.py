@@ -25,6 +25,17 @@ def test_pages_fit_a_phone_and_have_one_heading(service: Up, open_window: Open, 
     assert page.evaluate("document.documentElement.scrollWidth") <= 360
 
 
+@pytest.mark.parametrize("width", [360, 1024])
+@pytest.mark.parametrize("noun", ["jobs", "models"])
+def test_the_pages_of_a_record_fit(
+    service: Up, model: SmallModel, open_window: Open, noun: str, width: int
+) -> None:
+    page = open_window(service, viewport={"width": width, "height": 740}).page
+    page.goto(f"/{noun}/{model.id}")
+    expect(page.locator("#facts dd" if noun == "jobs" else "#downloads td").first).to_be_visible()
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+
+
 def test_the_navigation_works_by_keyboard(page: Page) -> None:
     page.goto("/")
     expect(page.get_by_role("link", name="New")).to_have_attribute("aria-current", "page")

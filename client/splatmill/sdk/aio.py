@@ -16,6 +16,7 @@ from splatmill.schema import (
     Info,
     Job,
     JobPage,
+    LanAccess,
     Me,
     Model,
     ModelOrder,
@@ -294,6 +295,13 @@ class AsyncClient:
     async def me(self) -> Me:
         """Return who the server takes the caller for: owner, scopes, limits and their use."""
         return read_answer(Me, await self.connection.request("GET", "/v1/me"))
+
+    async def lan(self) -> LanAccess:
+        """Return the address and the key by which devices of the local network use the server.
+
+        It needs the scope admin. Raises NotFound where the server was not started by `splatmill up --lan`.
+        """
+        return read_answer(LanAccess, await self.connection.request("GET", "/v1/lan"))
 
     async def info(self) -> Info:
         """Return the version, the workers and the limits of the server."""

@@ -20,6 +20,7 @@ from splatmill.schema import (
     Info,
     Job,
     JobState,
+    LanAccess,
     LogLine,
     Me,
     Model,
@@ -553,6 +554,13 @@ class Client:
     def me(self) -> Me:
         """Return who the server takes the caller for: owner, scopes, limits and their use."""
         return self._loop.run(self._async.me())
+
+    def lan(self) -> LanAccess:
+        """Return the address and the key by which devices of the local network use the server.
+
+        It needs the scope admin. Raises NotFound where the server was not started by `splatmill up --lan`.
+        """
+        return self._loop.run(self._async.lan())
 
     def info(self) -> Info:
         """Return the version, the workers and the limits of the server."""

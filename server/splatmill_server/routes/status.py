@@ -39,6 +39,7 @@ from splatmill.schema import (
     Health,
     Info,
     Lan,
+    LanAccess,
     Limits,
     OptionList,
     QueueInfo,
@@ -52,7 +53,7 @@ from splatmill.schema.files.other_pictures import OTHER_FOLDERS, UNUSED
 from splatmill_server.access.caller import Caller, Who
 from splatmill_server.access.permission import needs
 from splatmill_server.base import metrics, scrape
-from splatmill_server.base.problems import LOGGED
+from splatmill_server.base.problems import LOGGED, ProblemError
 from splatmill_server.base.settings import Settings
 from splatmill_server.base.tls import fingerprint
 from splatmill_server.responses.docs_page import CONTENT_SECURITY_POLICY, docs_page
@@ -121,6 +122,21 @@ def _lan(settings: Settings) -> Lan | None:
     if settings.lan_url is None or settings.tls_certificate is None:
         return None
     return Lan(url=settings.lan_url, fingerprint=fingerprint(settings.tls_certificate))
+
+
+@router.get("/v1/lan", responses=problems("not_found"))
+@needs(Scope.admin)
+def get_lan(service: Shared, response: Response) -> LanAccess:
+    """Get the address and the key by which devices of the local network use the server (`splatmill up --lan`)."""
+    lan, key = _lan(service.settings), service.settings.api_key
+    if lan is None:
+        raise ProblemError(
+            "not_found",
+            "The server was not started for the devices of the local network.",
+            advice="Start it with `splatmill up --lan`.",
+        )
+    response.headers["Cache-Control"] = "no-store"
+    return LanAccess(**lan.model_dump(), key=None if key is None else key.get_secret_value())
 
 
 @router.get("/docs", include_in_schema=False)

@@ -7,6 +7,7 @@ from tests.support.hostile.table_colors import COLORS
 from tests.support.hostile.table_decoders import DECODERS
 from tests.support.hostile.table_files import FILES
 from tests.support.hostile.table_headers import HEADERS
+from tests.support.hostile.table_labels import LABELS
 from tests.support.hostile.table_lenses import LENSES
 from tests.support.hostile.table_meshes import MESHES
 from tests.support.hostile.table_models import MODELS
@@ -30,6 +31,7 @@ HOSTILE: tuple[Hostile, ...] = (
     *UNPACKED,
     *POSES,
     *PRESENTATION,
+    *LABELS,
     *PROGRAMS,
     *LENSES,
     *MODELS,

@@ -111,6 +111,14 @@ class Lan(Response):
     )
 
 
+class LanAccess(Lan):
+    """How devices of the local network reach and use the server: the response of `/v1/lan`."""
+
+    key: str | None = Field(
+        description="The key that all of them may use; null where the server has stored keys alone."
+    )
+
+
 class Info(Response):
     """The response of `/v1/info`."""
 

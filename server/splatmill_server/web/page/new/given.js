@@ -1,8 +1,8 @@
 // Files as people give them: dropped files and folders, and those chosen or taken with a camera.
 
-import { withoutTop } from "./kinds.js";
+import { suffix, withoutTop } from "./kinds.js";
 
-/** @typedef {{path: string, file: File}} Given */
+/** @typedef {{path: string, file: File, folder?: string}} Given  folder: the one that all were given in, which is not in the path */
 
 /**
  * Return the files of a drop, those in folders with their path. Throws an Error, as a sentence, for what cannot be read.
@@ -30,7 +30,17 @@ export function chosen(files) {
 /** @param {Given[]} files */
 function stripped(files) {
   const paths = withoutTop(files.map(({ path }) => path));
-  return files.map(({ file }, index) => ({ path: paths[index], file }));
+  return files.map(({ path, file }, index) => ({ path: paths[index], file, folder: path.slice(0, path.length - paths[index].length).replace(/\/$/, "") }));
+}
+
+/** What a scene of these files may be called: as their folder, the only file that is no photo by itself, or the day. @param {Given[]} given @param {import("./kinds.js").Accepted} accepted */
+export function nameOf(given, accepted) {
+  const folder = given[0].folder?.split("/").pop();
+  if (folder) return folder;
+  const [{ file }] = given;
+  const stem = file.name.slice(0, file.name.length - suffix(file.name).length);
+  return given.length === 1 && [...accepted.archives, ...accepted.videos].includes(suffix(file.name)) && stem ? stem
+    : new Date(file.lastModified).toLocaleDateString("en", { day: "numeric", month: "long", year: "numeric" });
 }
 
 /** @param {FileSystemEntry} entry @returns {Promise<Given[]>} */

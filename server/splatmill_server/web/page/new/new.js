@@ -7,7 +7,7 @@ import { exampleOffer } from "../example.js";
 import { estimateOf } from "./estimate.js";
 import { Gallery } from "./gallery.js";
 import { documentsIn } from "./documents.js";
-import { chosen, dropped } from "./given.js";
+import { chosen, dropped, nameOf } from "./given.js";
 import { Items } from "./items.js";
 import { suffix } from "./kinds.js";
 import { Looking } from "./looking/looking.js";
@@ -135,6 +135,7 @@ async function take(given) {
     notify(`None of these files can be used. ${items.remarks.join(" ") || `Photos are ${kinds} files.`}`, "warning");
   }
   start.adopt();
+  if (added.some(({ role }) => role)) start.suggest(nameOf(given, info.accepted));
   redraw();
 }
 

@@ -30,6 +30,8 @@ export class Start {
     this.capture = null;
     /** Whether the capture was there before, so that a job may be started without new files. */
     this.further = false;
+    /** The name that was filled in. */
+    this.suggested = "";
     /** @type {Upload | null} */
     this.offered = null;
     /** @type {Upload | null} */
@@ -43,6 +45,11 @@ export class Start {
 
   get name() {
     return /** @type {HTMLInputElement} */ (byId("name"));
+  }
+
+  /** Fill in a name where nobody has typed one. @param {string} name */
+  suggest(name) {
+    if (!this.name.value) this.name.value = this.suggested = name.slice(0, this.name.maxLength);
   }
 
   /** Start further jobs on a capture. @param {{id: string, name: string | null, files: Held[]}} capture */
@@ -67,6 +74,7 @@ export class Start {
   reset() {
     if (this.further) return;
     if (this.upload) forget();
+    if (this.name.value === this.suggested) this.name.value = "";
     this.upload = this.sending = this.capture = null;
     this.held = [];
     byId("sending").hidden = true;
