@@ -239,13 +239,14 @@ def test_a_real_training_goes_on_at_its_checkpoint_with_its_cameras(tmp_path: Pa
     said = "".join(lines)
     assert first.returncode == Exit.cancelled, said
     assert "matching" in said
-    done = subprocess.run(command, **pipes, timeout=300)
+    done = subprocess.run([*command, "--mesh"], **pipes, timeout=300)
     assert done.returncode == 0, done.stdout
     assert "matching" not in done.stdout
     assert "mapping" not in done.stdout
     steps = [step for line in done.stdout.splitlines() if (step := _step(line)) > 0]
     assert steps[0] >= max(_step(line) for line in lines)
     assert (out / "model.ply").is_file()
+    assert (out / "mesh.glb").read_bytes().startswith(b"glTF")
 
 
 def _step(line: str) -> int:

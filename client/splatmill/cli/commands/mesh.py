@@ -75,11 +75,14 @@ def mesh(
         if value is not None:
             raise typer.BadParameter(f"{hint} is for a model file.", param_hint=hint)
     with open_client(server) as client:
-        typer.echo(_made(client.model(model), out, wish))
+        typer.echo(write_mesh(client.model(model), out, **wish))
 
 
-def _made(model: "ModelHandle", out: Path, wish: dict[str, Any]) -> Path:
-    """Let the server make a mesh, show what it does, and download it."""
+def write_mesh(model: "ModelHandle", out: Path, **wish: Any) -> Path:
+    """Let the server make a mesh, show what it does, and download it to `out`.
+
+    wish: the fields of `MeshRequest`.
+    """
     from splatmill.cli.display.progress import make_display
 
     begun = model.meshes.start(**wish)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from splatmill.cli.commands.mesh import write_mesh
 from splatmill.cli.commands.models import download_files, print_summary, write_novel_view
 from splatmill.cli.display.follow import Interrupted, StoppedWaiting, follow_job
 from splatmill.cli.display.progress import make_display
@@ -80,6 +81,12 @@ def train(
             "--novel-view", help="Also write novel_view.png, an image from half-way between two cameras."
         ),
     ] = False,
+    mesh: Annotated[
+        bool,
+        typer.Option(
+            "--mesh", help="Also write mesh.glb, triangles of the surfaces on which the cameras agree."
+        ),
+    ] = False,
     fresh: Annotated[
         bool,
         typer.Option(
@@ -134,6 +141,8 @@ def train(
             written.append(write_novel_view(model, out / "novel_view.png"))
         if orbit:
             written.append(model.orbit(out / "orbit.mp4"))
+        if mesh:
+            written.append(write_mesh(model, out / "mesh.glb"))
         print_summary(model, written)
 
     with _sigterm_as_interrupt():

@@ -77,11 +77,12 @@ class Display(Protocol):
 
 
 class PlainDisplay:
-    """Prints lines to standard output, at most one every few seconds about one stage."""
+    """Prints lines to standard output, at most one every few seconds about one stage, and no progress twice in a row."""
 
     def __init__(self) -> None:
         self._stage = ""
         self._next = 0.0
+        self._last = ""
         self._held_back: Progress | None = None
 
     def __enter__(self) -> Self:
@@ -98,7 +99,7 @@ class PlainDisplay:
             self._held_back = progress
             return
         self._stage, self._next, self._held_back = progress.stage, now + PLAIN_INTERVAL, None
-        print(progress_text(progress), flush=True)
+        self._show(progress_text(progress))
 
     def print(self, line: str) -> None:
         self._flush()
@@ -107,8 +108,13 @@ class PlainDisplay:
     def _flush(self) -> None:
         """Print the last progress of a stage if it was held back for coming too soon after the line before."""
         if self._held_back is not None:
-            print(progress_text(self._held_back), flush=True)
+            self._show(progress_text(self._held_back))
             self._held_back = None
+
+    def _show(self, line: str) -> None:
+        if line != self._last:
+            print(line, flush=True)
+        self._last = line
 
 
 class LiveDisplay:
