@@ -18,9 +18,9 @@ import torch
 from splatmill.schema import CameraSpec, OrbitRequest
 from splatmill_worker.render_service.encoding import camera_of, render_frame
 from splatmill_worker.render_service.local import load
-from splatmill_worker.render_service.orbit import UP, orbit_cameras
 from splatmill_worker.splat.formats import ply
 from splatmill_worker.splat.gaussians import SH_C0, Gaussians
+from splatmill_worker.splat.orbit import UP, orbit_cameras
 from splatmill_worker.splat.render import render
 from tests.inputs.conftest import INPUTS
 from tests.support.gaussians import differences, some_gaussians

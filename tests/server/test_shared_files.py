@@ -16,7 +16,7 @@ import httpx
 import pytest
 
 from splatmill.backplane.jobs import row
-from splatmill.schema import Switch, TrainOptions
+from splatmill.schema import ProgressVideo, Switch, TrainOptions
 from splatmill_worker import pipeline
 from splatmill_worker.service.attempts.attempt import Attempt
 from splatmill_worker.service.attempts.publish import publish
@@ -54,7 +54,7 @@ def unpacked(content: bytes) -> bytes:
 def test_a_link_gives_out_nothing_about_the_machine(serve: Serve, tmp_path: Path) -> None:
     app = serve(api_key="s3cret")
     work = tmp_path / "work"
-    asked = TrainOptions(steps=40, max_gaussians=500, time_lapse=Switch.on, progress_video=True)
+    asked = TrainOptions(steps=40, max_gaussians=500, time_lapse=Switch.on, progress_video=ProgressVideo.view)
     outcome = pipeline.run(
         still_life.posed_capture(tmp_path / "capture"), work, asked, lambda _: None, lambda: False
     )

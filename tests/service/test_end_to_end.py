@@ -99,7 +99,7 @@ def test_posed_photos_become_a_model_whose_views_match_them(
     assert video.content[4:8] == b"ftyp"
 
     # From that model, filmed.
-    further = SMALL | {"steps": 40, "start": job_id, "progress_video": True}
+    further = SMALL | {"steps": 40, "start": job_id, "progress_video": "orbit"}
     answer = up.http.post("/v1/jobs", json={"capture": capture, "options": further})
     later_id = answer.json()["id"]
     later = up.ended(later_id, 200)

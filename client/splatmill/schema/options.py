@@ -55,6 +55,12 @@ class Switch(StrEnum):
     off = "off"
 
 
+class ProgressVideo(StrEnum):
+    off = "off"
+    view = "view"
+    orbit = "orbit"
+
+
 class Background(StrEnum):
     auto = "auto"
     black = "black"
@@ -219,9 +225,12 @@ class TrainOptions(Request):
         ),
         json_schema_extra=_PHOTOS,
     )
-    progress_video: bool = Field(
-        default=False,
-        description="Also write progress.mp4, a video of one view in the course of the training.",
+    progress_video: ProgressVideo = Field(
+        default=ProgressVideo.off,
+        description=(
+            "Also write progress.mp4, a video of the scene in the course of the training: from the view of one photo, "
+            "or from an orbit around the scene."
+        ),
         json_schema_extra=_PHOTOS,
     )
     time_lapse: Switch = Field(
@@ -388,6 +397,14 @@ class TrainOptions(Request):
                 f"{start[:80]!r} is neither the id of a model nor the name of a {start_suffixes()} file"
             )
         return safe_name(start)
+
+    @field_validator("progress_video", mode="before")
+    @classmethod
+    def _filmed_or_not(cls, video: Any) -> Any:
+        """Read true and false as view and off."""
+        return (
+            {True: ProgressVideo.view, False: ProgressVideo.off}[video] if isinstance(video, bool) else video
+        )
 
     @field_validator("scale")
     @classmethod

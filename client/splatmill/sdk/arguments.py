@@ -22,6 +22,7 @@ from splatmill.schema import (
     MeshFormat,
     Output,
     Preset,
+    ProgressVideo,
     Scale,
     Switch,
 )
@@ -42,7 +43,7 @@ class TrainArguments(TypedDict, total=False):
     test_views: Sequence[str] | None
     max_video_frames: int
     start: str | os.PathLike[str] | None
-    progress_video: bool
+    progress_video: ProgressVideo | Literal["off", "view", "orbit"]
     time_lapse: Switch | Literal["auto", "on", "off"]
     background: Background | Literal["auto", "black", "white", "random"]
     exposure: Switch | Literal["auto", "on", "off"]

@@ -58,6 +58,6 @@ def nth(number: int, files: dict[str, dict[str, bytes]]) -> Work:
     options = {
         "steps": _STEPS[(number + number // len(_TURN)) % len(_STEPS)],
         "max_gaussians": _GAUSSIANS,
-        "progress_video": number % 4 == 0,
+        "progress_video": "orbit" if number % 4 == 0 else "off",
     }
     return Work(kind, files[kind], PHOTOS, options)

@@ -33,7 +33,7 @@ def test_a_stage_is_told_at_once_and_again_after_a_while(capsys, monkeypatch):
         for n in range(4):
             display.progress(step(n))
             display.progress(step(n))
-    assert len(capsys.readouterr().out.splitlines()) == 4  # what is said again is not printed again
+    assert len(capsys.readouterr().out.splitlines()) == 4  # the same progress is not printed again
 
 
 @pytest.mark.parametrize(

@@ -11,9 +11,9 @@ import torch
 
 from splatmill.schema import OrbitRequest
 from splatmill.schema.files.formats import MODEL_FORMATS
-from splatmill_worker.render_service import orbit
 from splatmill_worker.render_service.encoding import camera_of, render_frame
 from splatmill_worker.render_service.local import load, overview
+from splatmill_worker.splat import orbit
 from splatmill_worker.splat.formats import registry
 from splatmill_worker.splat.gaussians import SH_C0, Gaussians
 

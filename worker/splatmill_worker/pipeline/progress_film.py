@@ -1,9 +1,10 @@
-"""The progress video: one view of the scene while it is trained, most often at the beginning."""
+"""The progress video: the scene while it is trained, from one view or from an orbit, most often at the beginning."""
 
 from __future__ import annotations
 
 import shutil
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +15,11 @@ from splatmill.files import replacing
 from splatmill.schema import format_duration
 from splatmill_worker.film import Film, with_even_sides
 from splatmill_worker.images.guarded import own_picture
+from splatmill_worker.splat.orbit import OrbitPath, fit_path
 from splatmill_worker.splat.plan.plan import Plan
-from splatmill_worker.splat.train.renderer import render_view
+from splatmill_worker.splat.train.renderer import evaluation_background, renderer
 from splatmill_worker.splat.train.run import TrainingRun
-from splatmill_worker.splat.views import TrainingView
+from splatmill_worker.splat.views import Target, TrainingView
 
 INTERVALS = 96
 TAKEN_AT = tuple((i / INTERVALS) ** 2 for i in range(INTERVALS + 1))
@@ -39,12 +41,15 @@ class ProgressFilm:
     """Observes a training run and keeps each frame as a JPEG in `folder`, so that a later attempt goes on with them.
 
     view: the view that is shown.
+    path: from where it is shown instead, once around in the course of the film; None: from where it is.
     anew: drop the frames of earlier attempts.
     seconds: wall time of the frames and the video in this attempt.
     """
 
-    def __init__(self, folder: Path, view: TrainingView, plan: Plan, *, anew: bool) -> None:
-        self._folder, self._view, self._plan = folder, view, plan
+    def __init__(
+        self, folder: Path, view: TrainingView, plan: Plan, path: OrbitPath | None, *, anew: bool
+    ) -> None:
+        self._folder, self._view, self._plan, self._path = folder, view, plan, path
         if anew:
             shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True, exist_ok=True)
@@ -59,17 +64,28 @@ class ProgressFilm:
     def observe(self, run: TrainingRun) -> None:
         """Take the frame that is due."""
         started = time.perf_counter()
-        color = render_view(run.engine, self._plan, self._view)
+        while self.is_due(run):
+            self._next += 1
+        number = self._next - 1
+        color = renderer(run.engine, self._plan)(
+            self._target(number / INTERVALS), evaluation_background(self._plan, [self._view])
+        )
         picture = Image.fromarray(
             with_even_sides((color.detach().clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy())
         )
         _caption(picture, f"{format_duration(run.clock.seconds)}   {run.engine.count:,} Gaussians")
-        while self.is_due(run):
-            self._next += 1
-        path = self._folder / f"{self._next - 1:03d}.jpg"
+        path = self._folder / f"{number:03d}.jpg"
         with replacing(path) as part:
             picture.save(part, "JPEG", quality=QUALITY, subsampling=0)
         self.seconds += time.perf_counter() - started
+
+    def _target(self, share: float) -> Target:
+        """What is shown at a share of the film."""
+        target = self._view.full
+        if self._path is None:
+            return target
+        viewmat = torch.as_tensor(self._path.viewmat(share), dtype=torch.float32)
+        return target._replace(viewmat=viewmat)
 
     def develop(self, path: Path) -> bool:
         """Write the frames so far as a video, the last one for a second longer; returns False where there are none.
@@ -91,6 +107,16 @@ class ProgressFilm:
                 film.add(pixels)
         self.seconds += time.perf_counter() - started
         return True
+
+
+def orbit_of(views: Sequence[TrainingView]) -> OrbitPath:
+    """The path of a film around what the photos of a scene show, in its training world."""
+    cameras = [view.full.camera for view in views]
+    return fit_path(
+        np.array([camera.center for camera in cameras]),
+        np.array([camera.axis for camera in cameras]),
+        np.array([-camera.viewmat[1, :3] for camera in cameras]),
+    )
 
 
 def _caption(picture: Image.Image, text: str) -> None:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from splatmill.schema import TIME_LAPSE
+from splatmill.schema import TIME_LAPSE, ProgressVideo
 from splatmill_worker.pipeline.cameras import Cameras
 from splatmill_worker.pipeline.events import TrainingEvents
 from splatmill_worker.pipeline.job import Job
 from splatmill_worker.pipeline.live import LiveScene
 from splatmill_worker.pipeline.photos import Photos
-from splatmill_worker.pipeline.progress_film import ProgressFilm
+from splatmill_worker.pipeline.progress_film import ProgressFilm, orbit_of
 from splatmill_worker.pipeline.time_lapse import TimeLapse
 from splatmill_worker.splat.engine.protocol import Engine
 from splatmill_worker.splat.plan.plan import Plan
@@ -66,8 +66,11 @@ def train_scene(
 def _recording(job: Job, cameras: Cameras, photos: Photos, plan: Plan, *, anew: bool) -> Recording:
     """anew: drop what earlier attempts recorded."""
     film = lapse = None
-    if job.options.progress_video:
-        film = ProgressFilm(job.workdir / "film", photos.shown, plan, anew=anew)
+    if job.options.progress_video is not ProgressVideo.off:
+        path = None
+        if job.options.progress_video is ProgressVideo.orbit:
+            path = orbit_of([*photos.training, *photos.held_out])
+        film = ProgressFilm(job.workdir / "film", photos.shown, plan, path, anew=anew)
     if job.keeps_time_lapse:
         folder = job.workdir / TIME_LAPSE
         lapse = TimeLapse(folder, cameras.exported, anew=anew, antialiased=plan.antialias)

@@ -338,7 +338,7 @@ class RenderApp:
         return MeshResponse(lines, headers)
 
     def _orbit_cameras(self, model: LoadedModel, body: OrbitRequest) -> list[Camera]:
-        from splatmill_worker.render_service.orbit import orbit_cameras
+        from splatmill_worker.splat.orbit import orbit_cameras
 
         try:
             text = self._storage.get(layout.model_file(model.id, "cameras.json"))

@@ -15,9 +15,9 @@ from splatmill_worker.errors import ModelUnreadable
 from splatmill_worker.render_service.encoding import camera_of
 from splatmill_worker.render_service.local import REFUSED, STOPPED, UNWRITABLE, read
 from splatmill_worker.render_service.loss import Loss, Viewpoint, look, loss
-from splatmill_worker.render_service.orbit import orbit_cameras
 from splatmill_worker.splat.formats import registry
 from splatmill_worker.splat.gaussians import Gaussians
+from splatmill_worker.splat.orbit import orbit_cameras
 
 MOST_VIEWS = 12
 """Views that are compared at most: they cost about 0.1 s each."""

@@ -19,9 +19,9 @@ from splatmill_worker.errors import ModelUnreadable
 from splatmill_worker.film import Film
 from splatmill_worker.render_service.encoding import render_frame, render_image
 from splatmill_worker.render_service.model_cache import LoadedModel, antialias_of
-from splatmill_worker.render_service.orbit import DEFAULT_FOV, Float, orbit_cameras, path_of
 from splatmill_worker.splat.formats import registry
 from splatmill_worker.splat.formats.contents import Contents
+from splatmill_worker.splat.orbit import DEFAULT_FOV, Float, orbit_cameras, path_of
 
 UNWRITABLE, REFUSED, STOPPED = 1, 5, 130
 """Exit statuses, those of the command line: a file cannot be read or written; the model cannot be used; Ctrl-C."""

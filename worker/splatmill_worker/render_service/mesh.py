@@ -26,10 +26,10 @@ from splatmill_worker.mesh.poisson import TooFine
 from splatmill_worker.mesh.triangles import Mesh
 from splatmill_worker.render_service.encoding import camera_of
 from splatmill_worker.render_service.local import AXES, REFUSED, STOPPED, UNWRITABLE, read
-from splatmill_worker.render_service.orbit import DEFAULT_FOV, UP, Float, cameras_along, path_of
 from splatmill_worker.sandbox import FIRST_TO_DIE
 from splatmill_worker.scene import Camera
 from splatmill_worker.splat.gaussians import Gaussians
+from splatmill_worker.splat.orbit import DEFAULT_FOV, UP, Float, cameras_along, path_of
 
 RINGS = (-0.2, 0.35, 1.1)
 """Heights of the rings of cameras around a model without cameras, in radii of the lowest."""

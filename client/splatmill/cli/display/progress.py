@@ -77,7 +77,7 @@ class Display(Protocol):
 
 
 class PlainDisplay:
-    """Prints lines to standard output, at most one every few seconds about one stage, and no progress twice in a row."""
+    """Prints lines to standard output, at most one every few seconds about one stage, none twice in a row."""
 
     def __init__(self) -> None:
         self._stage = ""

@@ -64,6 +64,13 @@ class OrbitPath:
         around = math.cos(azimuth) * self.right + math.sin(azimuth) * self.front
         return self.target + self.radius * around + height * self.up
 
+    def viewmat(self, share: float) -> Float:
+        """Return the world-to-camera matrix [4,4] of the camera at a share of the video, which faces the target."""
+        eye = self.eye(share)
+        forward = _unit(self.target - eye, self.front)
+        right = _unit(np.cross(forward, self.up), self.right)
+        return viewmat_of(np.stack([right, np.cross(forward, right), forward]), eye)
+
 
 def fit_path(centers: Float, forwards: Float, ups: Float) -> OrbitPath:
     """Return the path that fits cameras: their positions, viewing directions and upward directions, [N,3] each.
@@ -112,11 +119,7 @@ def cameras_along(path: OrbitPath, request: OrbitRequest, fov_y_deg: float) -> I
     """Yield one camera per frame, looking at the path's target. fov_y_deg: vertical field of view in degrees."""
     focal = 0.5 * request.height / math.tan(math.radians(fov_y_deg) / 2)
     for index in range(request.frames):
-        eye = path.eye(index / request.frames)
-        forward = _unit(path.target - eye, path.front)
-        right = _unit(np.cross(forward, path.up), path.right)
-        rotation = np.stack([right, np.cross(forward, right), forward])
-        viewmat = viewmat_of(rotation, eye)
+        viewmat = path.viewmat(index / request.frames)
         yield Camera(
             request.width, request.height, focal, focal, request.width / 2, request.height / 2, viewmat
         )

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from splatmill.schema import CameraPath, CameraSpec, Keyframe, OrbitRequest
-from splatmill_worker.render_service import orbit
+from splatmill_worker.splat import orbit
 
 
 def ring(first: float, last: float, count: int = 12) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
