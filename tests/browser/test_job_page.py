@@ -9,6 +9,7 @@ The service, the worker and the browser are real. Not proved here: what a snapsh
 from __future__ import annotations
 
 import io
+import re
 import socket
 import threading
 from collections.abc import Iterator
@@ -18,7 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Page, Route, expect
 
 from tests.browser.conftest import Open, SmallModel, Visit
 from tests.support import still_life
@@ -89,7 +90,7 @@ def relay(service: Up) -> Iterator[Relay]:
 
 @pytest.fixture(scope="module")
 def capture(service: Up, tmp_path_factory: pytest.TempPathFactory) -> str:
-    """The still life with its cameras, and one photo without a camera."""
+    """The still life with its cameras, one photo without a camera, and a mask of no photo."""
     folder = still_life.posed_capture(tmp_path_factory.mktemp("job") / "capture")
     Image.new("RGB", (still_life.WIDTH, still_life.HEIGHT)).save(folder / "images" / "stray.png")
     capture = str(service.http.post("/v1/captures", json={"name": "still life"}).json()["id"])
@@ -97,6 +98,8 @@ def capture(service: Up, tmp_path_factory: pytest.TempPathFactory) -> str:
         for path in sorted((folder / role).iterdir()):
             answer = service.http.put(f"/v1/captures/{capture}/{role}/{path.name}", content=path.read_bytes())
             assert answer.status_code == 201, answer.text
+    mask = (folder / "images" / "stray.png").read_bytes()
+    assert service.http.put(f"/v1/captures/{capture}/masks/nobody.png", content=mask).status_code == 201
     return capture
 
 
@@ -142,6 +145,9 @@ def test_the_scene_is_watched_while_it_trains(service: Up, capture: str, open_wi
     snapshots(page, 1)
     first = seen(page)
     assert first.std() > 0.05
+    expect(page.locator("#stages")).to_contain_text("left of this stage")
+    expect(page.locator("#warnings")).to_contain_text("belongs to no photo by name")
+    assert page.evaluate("scrollY + document.querySelector('#warnings').getBoundingClientRect().bottom") < 500
     # Somebody turns the scene: the next snapshots are seen from the same side.
     box = page.locator("#live .box[data-snapshots]")
     before = box.get_attribute("data-pose")
@@ -354,7 +360,17 @@ def test_a_scene_that_comes_before_its_cameras_is_seen_from_where_they_are(
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_the_page_fits_a_phone(service: Up, model: SmallModel, open_window: Open, scheme: str) -> None:
     page = open_window(service, viewport={"width": 360, "height": 740}, color_scheme=scheme).page
-    page.goto(f"/jobs/{model.id}")
+    # Until the server has answered, nothing is shown that may be false.
+    held: list[Route] = []
+    for late in ("events", "report"):
+        page.route(f"**/v1/jobs/{model.id}/{late}", lambda route: held.append(route))
+        with page.expect_request(f"**/{late}"):
+            held.pop().continue_() if held else page.goto(f"/jobs/{model.id}")
+        expect(page.get_by_role("heading", level=1)).to_have_text("still life")
+        page.evaluate("new Promise((drawn) => requestAnimationFrame(() => requestAnimationFrame(drawn)))")
+        shown = page.locator("main").inner_text()
+        assert not re.search("in a moment|Waiting|Nothing was measured|Nothing can be seen", shown), shown
+    held.pop().continue_()
     expect(page.get_by_role("link", name="Open the model")).to_be_visible()
     page.locator("#curve summary").click()
     expect(page.locator("#curve svg")).to_be_visible()

@@ -1,9 +1,9 @@
 // The course of a job, from its events: a reader of the same events gets the same course, from whichever event it begins.
 
-import { FINAL } from "../job_states.js";
+import { FINAL, STATES } from "../job_states.js";
 
 /** Names of the stages that progress is reported of. */
-export const STAGES = new Map(Object.entries({
+const STAGES = new Map(Object.entries({
   staging: "Fetching the photos",
   images: "Examining the photos",
   features: "Finding features",
@@ -13,6 +13,11 @@ export const STAGES = new Map(Object.entries({
   stereo: "Adding points by stereo",
   training: "Training",
 }));
+
+/** The name of a stage for people. @param {string} stage */
+export function stageName(stage) {
+  return STAGES.get(stage) ?? stage.replaceAll("_", " ");
+}
 
 const MOST_LINES = 1000;
 
@@ -64,6 +69,15 @@ export class Course {
 
   get final() {
     return FINAL.includes(this.state);
+  }
+
+  /** Whether this has come as far as a record of the job says. @param {any} job */
+  reached({ state, attempt, progress }) {
+    if (FINAL.includes(state)) return this.final;
+    if (state === "queued") return this.spans.length > 0;
+    const [here, there] = [this.state, state].map((one) => Object.keys(STATES).indexOf(one));
+    if (this.attempt !== attempt || here !== there) return this.attempt > attempt || (this.attempt === attempt && here > there);
+    return !progress || (this.stages.get(progress.stage)?.done ?? -1) >= progress.done;
   }
 
   /** Add what an event says. @param {any} record */

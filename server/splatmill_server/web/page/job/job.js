@@ -7,7 +7,7 @@ import { bytes, count, decibels, moment, number, seconds } from "../format.js";
 import { FINAL, badgeKind, badgeText } from "../job_states.js";
 import { labelButton, starButton, tagLinks } from "../labels.js";
 import { confirmAction, noticeOf, notify, startShell } from "../shell.js";
-import { Course } from "./course.js";
+import { Course, stageName } from "./course.js";
 import { LiveScene } from "./live_scene.js";
 import { estimateOf, notificationButton, secondsLeft, sentenceOf, showNotification } from "./left.js";
 import { showLog, warningsOf } from "./log.js";
@@ -20,6 +20,8 @@ import { Watching } from "./watching.js";
 const QUEUE_MS = 3000;
 /** Milliseconds for which the server surely keeps a snapshot. */
 const KEPT_MS = 45_000;
+/** Milliseconds of a connection after which a job that runs is shown although not all was heard. */
+const LONGEST_MS = 8000;
 /** Names of the stages in a report, for people; docs/report.md says what each holds. */
 const REPORTED = { sfm: "Cameras", load: "Loading photos", plan: "Planning", train: "Training", evaluate: "Measuring the error", export: "Writing the model", film: "Progress video", live: "Live view", time_lapse: "Time-lapse" };
 
@@ -43,6 +45,8 @@ let drawing = 0;
 let estimate = new Map();
 let notifies = false;
 let stream = { close() {} };
+/** Whether all is heard that had happened when the record was asked for: nothing is shown anew before. */
+let caughtUp = false;
 const watching = new Watching(id, () => job !== null && watchBox.checked && !course.final && !FINAL.includes(job.state));
 
 /** @type {HTMLAnchorElement} */ (byId("log-file")).href = `${address}/logs?format=text`;
@@ -54,8 +58,6 @@ try {
 } catch (error) {
   if (!(error instanceof Problem)) throw error;
   byId("outcome").replaceChildren(noticeOf(error));
-  byId("state").hidden = true;
-  for (const card of document.querySelectorAll("main .card")) /** @type {HTMLElement} */ (card).hidden = true;
 }
 
 /** Follow the events from the first one on. */
@@ -64,9 +66,9 @@ function begin() {
   stream.close();
   stream = follow(id, heard, connection, () => {
     course = new Course();
+    caughtUp = false;
     refresh();
   });
-  again();
   if (FINAL.includes(job.state)) return;
   const button = notificationButton((on) => (notifies = on));
   byId("notify").replaceChildren(...(button ? [button] : []));
@@ -84,8 +86,9 @@ function showName() {
 /** @param {any} record */
 function heard(record) {
   course.apply(record);
+  caughtUp ||= !course.final && course.reached(job); // what has ended is shown with what is fetched then
   if (course.final) ended();
-  if (record.event.type === "state") refresh();
+  if (record.event.type === "state" && (caughtUp || course.final)) refresh();
   again();
 }
 
@@ -98,6 +101,7 @@ function ended() {
 
 /** @param {boolean} open */
 function connection(open) {
+  if (open) setTimeout(() => (caughtUp ||= !course.final), LONGEST_MS);
   const lost = document.getElementById("lost");
   if (open || course.final) lost?.remove();
   else if (!lost) {
@@ -123,6 +127,7 @@ async function refresh() {
       byId("outcome").replaceChildren(noticeOf(error));
     }
   }
+  caughtUp ||= course.final;
   shown.state = "";
   again();
 }
@@ -160,7 +165,8 @@ function again() {
 
 function draw() {
   drawing = 0;
-  if (!job) return;
+  if (!job || !caughtUp || !(course.spans.length || course.final)) return;
+  byId("course").hidden = byId("state").hidden = false;
   if (shown.state !== course.state) {
     if (shown.state !== "" || course.final) byId("announcement").textContent = `${badgeText(course.state, false)}.`;
     shown.state = course.state;
@@ -192,6 +198,7 @@ function draw() {
     shown.cameras = course.cameras;
     fetchCameras();
   }
+  scene.expect(course.previews > 0 || course.cameras !== null);
   if (course.snapshot !== shown.snapshot && !course.final) {
     shown.snapshot = course.snapshot;
     // By the server's clock: this device's may be wrong.
@@ -203,7 +210,7 @@ function titleOf() {
   const name = job.name || `Job ${id}`;
   const { progress } = course;
   if (course.final || !progress?.total) return `${name}: ${badgeText(course.state, false).toLowerCase()}`;
-  return `${Math.floor((100 * progress.done) / progress.total)} % of ${progress.stage}: ${name}`;
+  return `${Math.floor((100 * progress.done) / progress.total)} % of ${stageName(progress.stage).toLowerCase()}: ${name}`;
 }
 
 /** The state, the outcome, and what may be done now. */

@@ -53,7 +53,7 @@ export function secondsLeft(course, estimate, now) {
 /** @param {number | null} left */
 export function sentenceOf(left) {
   if (left === null) return "";
-  return left < 5 ? "The job ends in a moment." : `About ${seconds(Math.round(left))} until the job ends.`;
+  return left < 5 ? "The whole job ends in a moment." : `About ${seconds(Math.round(left))} until the whole job ends.`;
 }
 
 /**

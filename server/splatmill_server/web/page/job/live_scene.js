@@ -44,7 +44,7 @@ export class LiveScene {
       cameras: h("div", { class: "box", hidden: true }),
       picture: h("div", { class: "box", hidden: true }, this.picture),
     };
-    this.empty = h("p", { class: "waiting muted" }, "Nothing can be seen yet: cameras come first, then the scene.");
+    this.empty = h("p", { class: "waiting muted" });
     this.caption = h("p", { class: "small muted caption" });
     this.frusta = h("input", { type: "checkbox", id: "show-frusta", onchange: () => this.showFrusta() });
     this.buttons = /** @type {Record<Kind, HTMLButtonElement>} */ (Object.fromEntries(Object.entries(KINDS).map(([kind, title]) =>
@@ -55,6 +55,12 @@ export class LiveScene {
       h("div", { class: "row tools" }, h("div", { class: "row", role: "group", "aria-label": "What is shown" }, Object.values(this.buttons)), this.homeButton, this.frustaField),
       h("div", { class: "stage" }, this.empty, Object.values(this.boxes)),
       this.caption);
+  }
+
+  /** Say why the view is empty. @param {boolean} coming whether there is something, which is being loaded */
+  expect(coming) {
+    const text = coming ? "Loading" : "Nothing can be seen yet: cameras come first, then the scene.";
+    if (this.empty.textContent !== text) this.empty.textContent = text;
   }
 
   /** @param {Kind} kind */

@@ -3,7 +3,7 @@
 import { h } from "../dom.js";
 import { number, seconds } from "../format.js";
 import { STATES } from "../job_states.js";
-import { STAGES } from "./course.js";
+import { stageName } from "./course.js";
 
 /** Stages of structure from motion, in the order in which they come. */
 const SFM = ["images", "features", "pairs", "matching", "mapping", "stereo"];
@@ -34,7 +34,7 @@ export function showTimeline(list, course, now) {
 function current(course) {
   const stage = course.stages.get(course.progress.stage);
   if (!stage) return null;
-  const name = STAGES.get(stage.name) ?? stage.name.replaceAll("_", " ");
+  const name = stageName(stage.name);
   return h("div", { class: "stage-now" },
     stage.total
       ? h("progress", { max: stage.total, value: Math.min(stage.done, stage.total), "aria-label": name })
@@ -53,7 +53,7 @@ function sentence(course, stage, name) {
     parts.push(`${name}${stage.total ? `: ${number(stage.done)} of ${number(stage.total)}` : ""}`);
     if (stage.note && !/^(photos|pairs) /.test(stage.note)) parts.push(stage.note);
   }
-  if (stage.eta !== null) parts.push(`about ${seconds(stage.eta)} left`);
+  if (stage.eta !== null) parts.push(`about ${seconds(stage.eta)} left of this stage`);
   return `${parts.join(", ")}.`;
 }
 
@@ -62,7 +62,7 @@ function parts(course) {
   const over = SFM.map((name) => course.stages.get(name)).filter((stage) => stage && stage.name !== course.progress?.stage);
   if (!over.length) return null;
   return h("ul", { class: "small muted parts" }, over.map((stage) => stage && h("li", {},
-    `${STAGES.get(stage.name)}${amount(course, stage)}`)));
+    `${stageName(stage.name)}${amount(course, stage)}`)));
 }
 
 /** How much a stage that is over did. @param {import("./course.js").Course} course @param {import("./course.js").Stage} stage */

@@ -6,6 +6,7 @@ import { h } from "../dom.js";
 import { ago, moment, seconds } from "../format.js";
 import { FINAL, RUNNING, badgeKind, badgeText } from "../job_states.js";
 import { exampleOffer } from "../example.js";
+import { stageName } from "../job/course.js";
 import { starButton, tagLinks } from "../labels.js";
 import { listing } from "./listing.js";
 import { confirmAction, startShell } from "../shell.js";
@@ -24,7 +25,7 @@ function entry(job) {
         h("a", { class: "whole", href: `/jobs/${job.id}`, "data-focus": "open" }, name),
         h("span", { class: "badge", "data-state": badgeKind(job.state) }, badgeText(job.state, job.cancel_requested))),
       !done && progress?.total
-        ? h("progress", { value: progress.done, max: progress.total, "aria-label": `${name}: ${progress.stage}` }) : null,
+        ? h("progress", { value: progress.done, max: progress.total, "aria-label": `${name}: ${stageName(progress.stage)}` }) : null,
       tagLinks(job, "/jobs"),
       h("p", { class: "meta", title: `Created ${moment(job.created_at)}` }, facts(job).join(" · "))),
     h("div", { class: "actions" },
@@ -55,7 +56,7 @@ function facts(job) {
   }
   if (RUNNING.includes(job.state) && progress) {
     if (progress.psnr) sentences.push(`${progress.psnr.toFixed(1)} dB`);
-    if (progress.eta) sentences.push(`about ${seconds(progress.eta)} left`);
+    if (progress.eta) sentences.push(`${stageName(progress.stage)}: about ${seconds(progress.eta)} left`);
   }
   if (job.finished_at && job.started_at) sentences.push(`took ${seconds((Date.parse(job.finished_at) - Date.parse(job.started_at)) / 1000)}`);
   sentences.push(ago(job.created_at));
