@@ -113,7 +113,7 @@ POSES = (
     _transforms("a principal point at 1e300", models.transforms(cx=1e300), said="Frame 0"),
     _beside("a photo of 675 megapixels", "images/1.jpg", None, "used: 2 cameras", "27000 x 25000 pixels"),
     _beside(
-        "a photo that is cut off", "images/1.jpg", photo()[:-600], "the job fails: `image_truncated`", "1.jpg"
+        "a photo that is cut off", "images/1.jpg", photo()[:-600], "used: 2 cameras", "not decode completely"
     ),
     _beside("a photo that is an EPS", "images/1.jpg", pictures.EPS, "used: 2 cameras", "not an image"),
     _beside(

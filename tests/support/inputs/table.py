@@ -229,6 +229,13 @@ def with_test_set(folder: Path) -> None:
     transforms(folder / "transforms_test.json", frames()[:2])
 
 
+def posed_with_broken(folder: Path) -> None:
+    photos(folder / "images")
+    transforms(folder / "transforms.json")
+    cut = folder / "images" / NAMES[5]
+    cut.write_bytes(cut.read_bytes()[:-9])  # its size can still be read
+
+
 def two_cameras(numbers: Sequence[int], folder: Path) -> None:
     photos(folder / "images")
     again = frames()
@@ -344,6 +351,7 @@ EXAMPLES: tuple[Example, ...] = (
     Example("Cameras", "the photos in images_2 and images_4", two_sizes, "used with a remark"),
     Example("Cameras", "names of a model in the code page 1251", of_code_page, "used with a remark"),
     Example("Cameras", "one photo without a camera", no_camera, "used with a remark"),
+    Example("Cameras", "one photo of twelve is cut off", posed_with_broken, "used with a remark"),
     Example("Cameras", "a model of photos with other names", other_names, "refused"),
     Example(
         "Cameras", "transforms.json with a byte-order mark", with_frames(lambda of: None, "utf-8-sig"), "used"

@@ -73,15 +73,17 @@ def colors(path: Path, name: str) -> str:
 
 
 def alpha(path: Path) -> transparency.Extent:
-    """The smallest and the largest alpha of a photo, which is decoded only if its header says that it has any.
+    """The smallest and the largest alpha of a photo, which is decoded to its end.
 
     Raises UnusablePicture and OSError.
     """
     with guarded.opened(path) as image:
-        if not (image.has_transparency_data or image.mode in ("RGBa", "La")):
-            return 255, 255
+        if image.format == "JPEG":
+            image.draft(None, (1, 1))  # the smallest DCT scale, which still reads the whole file
         with guarded.room(image):
-            return transparency.extent(whole(image, path.name))
+            photo = whole(image, path.name)
+            check_numbers(image, path.name)
+        return transparency.extent(photo)
 
 
 def orientation(image: Image.Image) -> int:

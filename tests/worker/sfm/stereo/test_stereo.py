@@ -11,15 +11,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from splatmill.schema import TrainOptions
 from splatmill_worker import synthetic
-from splatmill_worker.errors import Cancelled, UnusablePicture
+from splatmill_worker.errors import Cancelled
 from splatmill_worker.images.load import load_views
-from splatmill_worker.pipeline.capture import posed_scene
 from splatmill_worker.scene import Scene, View
 from splatmill_worker.sfm import stereo
 from splatmill_worker.sfm.stereo.plane_sweep import GreyView, sweep
-from tests.support import still_life
 
 pytestmark = pytest.mark.slow
 
@@ -131,18 +128,6 @@ def test_the_search_is_given_up_for_photos_without_a_common_scene(bare: Scene, t
     assert found.given_up
     assert len(found.points) == 0
     assert stereo.add(bare, found).facts["stereo_points"] == 0
-
-
-def test_a_photo_that_does_not_decode_is_not_reported_as_invalid_poses(tmp_path: Path) -> None:
-    capture = still_life.posed_capture(tmp_path / "capture")
-    photo = capture / "images" / "03.png"
-    photo.write_bytes(photo.read_bytes()[:2000])  # its size can still be read
-    stages: list[str] = []
-    with pytest.raises(UnusablePicture, match=r"03\.png: it does not decode completely"):
-        posed_scene(
-            capture, tmp_path / "work", TrainOptions(), lambda stage, *_: stages.append(stage), lambda: False
-        )
-    assert set(stages) <= {"features"}  # of the photos before it
 
 
 def test_scenes_with_enough_points_get_none(bare: Scene, tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from splatmill.data_sets import (
     unread_cameras,
     walk,
 )
-from splatmill.schema.files.photos import PHOTO_FORMATS, PHOTO_SUFFIXES
+from splatmill.schema.files.photos import PHOTO_SUFFIXES
 from splatmill.schema.quantities import listed
 from splatmill_worker.errors import UnusablePicture
 from splatmill_worker.images import lens, mask_levels, transparency
@@ -29,8 +29,9 @@ from splatmill_worker.images.photo_colors import sentences
 from splatmill_worker.images.prepare import names_remark
 from splatmill_worker.scene import Scene, Source, View, without
 from splatmill_worker.sfm.posed import colmap_model, parts, programs, transforms
-from splatmill_worker.sfm.posed.files import ImageFiles
+from splatmill_worker.sfm.posed.files import ImageFiles, none_usable
 from splatmill_worker.sfm.posed.programs import ProgramCameras
+from splatmill_worker.wording import plain
 
 POSE_FOLDERS = ("poses", "")
 """Folders of a capture in which cameras are looked for, in order."""
@@ -71,7 +72,7 @@ class PosedInput:
             scene = programs.load(self.program, files, self.notes)
         else:
             scene = transforms.load(self.transforms, self.source, files, self.directory, self.notes)
-        scene = _by_transparency(_without_unfit_masks(scene))
+        scene = _decoded(_without_unfit_masks(scene))
         masks = [view.mask for view in scene.views if view.mask is not None]
         unused = {name for name in files.unused_masks if files.masks[name] not in masks}
         judged = mask_levels.judged({view.name: view.mask for view in scene.views}, unused)
@@ -178,29 +179,41 @@ def _unused(names: Sequence[str], cameras: Cameras) -> tuple[str, ...]:
     return tuple(warnings)
 
 
-def _by_transparency(scene: Scene) -> Scene:
-    """The scene without wholly transparent photos, and with a warning about opaque ones among cut-outs."""
+def _decoded(scene: Scene) -> Scene:
+    """The scene without photos that do not decode, or are wholly transparent, and with a warning about opaque ones
+    among cut-outs."""
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         alphas = list(pool.map(_alpha, scene.views))
-    clear = [index for index, alpha in enumerate(alphas) if transparency.is_clear(alpha)]
+    broken = [
+        (view.name, alpha) for view, alpha in zip(scene.views, alphas, strict=True) if isinstance(alpha, str)
+    ]
+    if broken and len(broken) == len(scene.views):
+        raise none_usable(broken)
+    whole = {
+        view.name: alpha
+        for view, alpha in zip(scene.views, alphas, strict=True)
+        if not isinstance(alpha, str)
+    }
+    for name, reason in broken:
+        scene = without(scene, [i for i, view in enumerate(scene.views) if view.name == name], reason)
+    clear = [index for index, view in enumerate(scene.views) if transparency.is_clear(whole[view.name])]
     if clear and len(clear) == len(scene.views):
         raise ValueError(
             f"All {len(clear)} photos with a camera are wholly transparent, so they show nothing."
         )
-    of = {view.name: alpha for view, alpha in zip(scene.views, alphas, strict=True)}
     scene = without(scene, clear, transparency.NOTHING)
-    said = transparency.remarks({view.name: of[view.name] for view in scene.views})
+    said = transparency.remarks({view.name: whole[view.name] for view in scene.views})
     return replace(scene, warnings=(*scene.warnings, *said))
 
 
-def _alpha(view: View) -> transparency.Extent:
-    """The extent of a photo; of one that does not decode, which the loading of photos names, that of an opaque one."""
-    if view.image.suffix.lower() in PHOTO_FORMATS["JPEG"]:
-        return 255, 255
+def _alpha(view: View) -> transparency.Extent | str:
+    """The extent of a photo, or why it cannot be used."""
     try:
         return decoders.alpha(view.image)
-    except (UnusablePicture, OSError):
-        return 255, 255
+    except UnusablePicture as error:
+        return error.reason
+    except OSError as error:
+        return f"it cannot be read: {plain(error)}"
 
 
 def _without_unfit_masks(scene: Scene) -> Scene:
