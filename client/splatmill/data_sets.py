@@ -44,6 +44,8 @@ PROGRAM_FILES = {
     "RealityScan, RealityCapture (also for Postshot)": ("*.csv", "*.xmp"),
     "OpenSfM, OpenDroneMap": ("reconstruction.json",),
     "Bundler": ("*.out",),
+    "VisualSFM": ("*.nvm",),
+    "Record3D": ("metadata.json", "metadata"),
 }
 """Other programs whose cameras are read, with patterns of the names, in lower case, of their files.
 
@@ -65,16 +67,21 @@ OTHER_CAMERAS = {
     "Metashape (its project)": ("*.psx",),
     "OpenMVG": ("sfm_data.json", "sfm_data.bin"),
     "Meshroom": ("*.sfm",),
-    "VisualSFM": ("*.nvm",),
     "Bundler (with another lens)": ("*.rd",),
     "KRT, as of Middlebury": ("*_par.txt", "*.krt"),
     "OpenMVS": ("*.mvs",),
     "LLFF": ("poses_bounds.npy",),
-    "Record3D": ("*.r3d",),
+    "RealityScan, RealityCapture (their project)": ("*.rsproj", "*.rcproj"),
+    "Pix4D": ("*_calibrated_*.txt",),
+    "MVSNet": ("*_cam.txt",),
+    "7-Scenes": ("*.pose.txt",),
+    "TUM RGB-D": ("groundtruth.txt",),
+    "Replica": ("traj.txt",),
+    "NeuS, DTU": ("cameras.npz", "cameras_sphere.npz"),
 }
 """Programs whose cameras are not read, with patterns of the names, in lower case, of their files."""
 
-LARGE = ("*.mvs", "*.r3d")
+LARGE = ("*.mvs",)
 """Patterns of OTHER_CAMERAS whose files hold points or photos too, so that they are not sent to be named by the job."""
 
 

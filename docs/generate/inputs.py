@@ -26,6 +26,7 @@ from splatmill_worker.images.no_photo import TRAITS
 from splatmill_worker.images.photo_colors import PhotoColors
 from splatmill_worker.readers import scan
 from splatmill_worker.readers.colmap_files import MODELS
+from splatmill_worker.readers.programs.shots import MAX_LENGTH_ERROR
 from splatmill_worker.scene import MIN_SHOWN
 from splatmill_worker.sfm.posed import colmap_model, model_files, points, polycam, triangulation
 from tests.support.inputs.example import answer
@@ -235,9 +236,16 @@ def _cameras() -> list[str]:
         - **Bundler**, as COLMAP, RealityScan, Metashape and others write it too: version 0.3, with its points. The
         names of the photos are in a list beside it, such as `list.txt`, which is needed.
 
+        - **VisualSFM**, as COLMAP writes it too: `.nvm` of the versions NVM_V3 and NVM_V3_R9T, with its points; a
+        calibration of all photos (FixedK) is refused. Of several models, the one with the most photos is used.
+
+        - **Record3D**: the `.r3d`, or its folder or an export with `metadata.json`, with the photos called by their
+        numbers. The depth maps are not used.
+
         A frame without a matrix is left out with a warning. Up to {model_files.MOST_FAULTY:.0%} of the poses are left
         out if no camera can have them (mirrored, sheared, not finite); with more, the job fails and names the first. It
-        fails also if no photo has a camera, or if a file with cameras cannot be read.""",
+        fails also if no photo has a camera, or if a file with cameras cannot be read. Quaternions are brought to the
+        length 1; one whose length differs from it by more than {MAX_LENGTH_ERROR:.0%} is no rotation.""",
         "### Lenses\n",
         table(
             ["COLMAP's model", "parameters", "photos"],

@@ -223,6 +223,71 @@ def opensfm(folder: Path, viewmats: Sequence[Float], names: Sequence[str]) -> Pa
     return path
 
 
+def quaternion(rotation: Float) -> list[float]:
+    """w, x, y, z of a rotation by less than half a turn."""
+    w = 0.5 * math.sqrt(1.0 + float(np.trace(rotation)))
+    skew = rotation - rotation.T
+    return [w, *(np.array([skew[2, 1], skew[0, 2], skew[1, 0]]) / (4.0 * w)).tolist()]
+
+
+VISUALSFM = 530.0, -0.06
+
+
+def visualsfm_project(points: Float) -> Float:
+    """The manual of VisualSFM: m (1 + r |m|^2) is where a pinhole sees what the photo shows at m, over f."""
+    f, r = VISUALSFM
+    plain = points[:, :2] / points[:, 2:]
+    shown = plain
+    for _ in range(100):
+        shown = plain / (1.0 + r * (shown * shown).sum(axis=1, keepdims=True))
+    return np.asarray(np.array(SIZE) / 2 + f * shown)
+
+
+def visualsfm(folder: Path, viewmats: Sequence[Float], names: Sequence[str], *, matrix: bool = False) -> Path:
+    lines = ["NVM_V3_R9T" if matrix else "NVM_V3 ", "", str(len(names))]
+    f, r = VISUALSFM
+    for viewmat, name in zip(viewmats, names, strict=True):
+        rotation, shift = viewmat[:3, :3], viewmat[:3, 3]
+        pose = (
+            [*rotation.ravel().tolist(), *shift.tolist()]
+            if matrix
+            else [*quaternion(rotation), *(-rotation.T @ shift).tolist()]
+        )
+        shown = name.replace(" ", '"')
+        lines.append(f"images/{shown}\t{' '.join(map(repr, [f, *pose, r, 0]))}")
+    lines += ["", "2"] + ["1.5 2.5 3.5 10 20 30 2 0 7 1.0 2.0 1 8 -3.0 4.0"] * 2
+    path = folder / "scene.nvm"
+    path.write_text("\n".join([*lines, "", "0"]) + "\n")
+    return path
+
+
+RECORD3D = 520.0, 524.0, 311.0, 246.5
+
+
+def record3d(path: Path, viewmats: Sequence[Float], *, each: bool) -> Path:
+    """The metadata of photos called 0.jpg, 1.jpg and so on. each: whether every photo has a lens of its own."""
+    fx, fy, cx, cy = RECORD3D
+    poses = []
+    for viewmat in viewmats:
+        world = np.linalg.inv(viewmat).astype(np.float64)
+        w, x, y, z = quaternion(world[:3, :3])
+        # Times the quaternion i, which is FLIP.
+        poses.append([w, z, -y, -x, *world[:3, 3].tolist()])
+    lenses = [[fx, fy, cx, cy]] * len(poses) if each else []
+    k = [1.0, 0, 0, 0, 1.0, 0, 1.0, 1.0, 1] if each else [fx, 0, 0, 0, fy, 0, cx, cy, 1]
+    document = {
+        "w": SIZE[0],
+        "h": SIZE[1],
+        "K": k,
+        "poses": poses,
+        "perFrameIntrinsicCoeffs": lenses,
+        "fps": 60,
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(document))
+    return path
+
+
 @dataclass(frozen=True)
 class Program:
     """A function that writes a file of cameras and returns its path, and the projection to pixels of points [N,3]."""
@@ -237,4 +302,5 @@ PROGRAMS = {
     "RealityScan, XMP": Program(reality_xmp, reality_project),
     "Bundler": Program(bundler, bundler_project),
     "OpenSfM": Program(opensfm, opensfm_project),
+    "VisualSFM": Program(visualsfm, visualsfm_project),
 }

@@ -74,7 +74,7 @@ def answer(make: Callable[[Path], object]) -> Answer:
             )
     renamed = [f"{before!a} is stored as {after}." for before, after in found.renamed]
     results = [f"A result of an earlier training, not a photo: {path}." for path in found.outputs]
-    remarks = (*found.remarks, *renamed, *results, *said)
+    remarks = tuple(dict.fromkeys((*found.remarks, *renamed, *results, *said)))
     hidden = f" and {masks} masks" if masks else ""
     used = f"{count} photos{hidden}, cameras {CAMERAS[source]}."
     return Answer("used with a remark" if remarks else "used", (used, *remarks))

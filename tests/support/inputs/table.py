@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import struct
+import tempfile
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -19,7 +20,7 @@ from tests.support import unmarked_zip
 from tests.support.inputs.example import Example, Kind
 from tests.support.panoramas import gpano, striped
 from tests.support.posed_sets import COUNT, NAMES, frames, model, photos, transforms, viewmat, zip_of
-from tests.support.program_files import PROGRAMS, SIZE
+from tests.support.program_files import PROGRAMS, SIZE, record3d
 
 Make = Callable[[Path], object]
 
@@ -125,6 +126,7 @@ PROGRAM_ANSWERS: dict[str, Kind] = {
     "RealityScan, XMP": "used",
     "Bundler": "used",
     "OpenSfM": "used with a remark",
+    "VisualSFM": "used",
 }
 
 
@@ -132,6 +134,32 @@ def of_program(program: str, folder: Path) -> None:
     """The file of another program, of OpenSfM with two reconstructions."""
     photos(folder / "images", size=SIZE)
     PROGRAMS[program].write(folder, [viewmat(k) for k in range(COUNT)], NAMES)
+
+
+def of_record3d(folder: Path) -> None:
+    photos(folder / "rgbd", [f"{k}.jpg" for k in range(COUNT)], SIZE)
+    record3d(folder / "metadata.json", [viewmat(k) for k in range(COUNT)], each=True)
+
+
+def r3d(folder: Path) -> None:
+    with tempfile.TemporaryDirectory() as name:
+        of_record3d(Path(name))
+        Path(name, "metadata.json").rename(Path(name, "metadata"))
+        zip_of(Path(name), folder / "scan.r3d")
+
+
+def scaled_rotations(length: float, folder: Path) -> None:
+    """A COLMAP model whose quaternions have this length."""
+
+    def change(text: str) -> bytes:
+        lines = [line.split(" ") for line in text.split("\n")]
+        for words in lines:
+            if words[-1].endswith(".jpg"):
+                words[1:5] = (repr(length * float(word)) for word in words[1:5])
+        return "\n".join(map(" ".join, lines)).encode()
+
+    photos(folder / "images")
+    model(folder / "sparse/0", change=change)
 
 
 def several_models(folder: Path) -> None:
@@ -371,6 +399,10 @@ EXAMPLES: tuple[Example, ...] = (
         Example("Cameras", f"cameras of {program}", partial(of_program, program), kind)
         for program, kind in PROGRAM_ANSWERS.items()
     ),
+    Example("Cameras", "cameras of Record3D", of_record3d, "used"),
+    Example("Cameras", "an .r3d of Record3D", r3d, "used"),
+    Example("Cameras", "quaternions of a model of the length 1.04", partial(scaled_rotations, 1.04), "used"),
+    Example("Cameras", "quaternions of a model of the length 2", partial(scaled_rotations, 2.0), "refused"),
     Example(
         "Cameras",
         "a reconstruction.json without cameras",

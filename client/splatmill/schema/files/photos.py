@@ -25,7 +25,7 @@ VIDEO_FORMATS = {"mov": (".mp4", ".mov", ".m4v"), "matroska": (".mkv", ".webm"),
 
 PHOTO_SUFFIXES = tuple(suffix for suffixes in PHOTO_FORMATS.values() for suffix in suffixes)
 VIDEO_SUFFIXES = tuple(suffix for suffixes in VIDEO_FORMATS.values() for suffix in suffixes)
-ARCHIVE_SUFFIXES = (".zip",)
+ARCHIVE_SUFFIXES = (".zip", ".r3d")
 
 EXAMPLE_FILE = "still-life.example"
 """Name of a file among the images, of any content. Where it is a capture's only file, the worker makes photos of the

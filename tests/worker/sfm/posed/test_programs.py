@@ -1,5 +1,6 @@
-"""Proves that cameras in files of Metashape, RealityScan, Bundler and OpenSfM become those of the same capture in the
-form of COLMAP: poses to 1e-6, and pixels, by the formulas of these programs, to 0.01. Wrong files are refused.
+"""Proves that cameras in files of Metashape, RealityScan, Bundler, OpenSfM, VisualSFM and Record3D become those of the
+same capture in the form of COLMAP: poses to 1e-6, and pixels, by the formulas of these programs, to 0.01. Wrong files
+are refused.
 
 Not proven here: that a release of such a program writes what its manual says.
 """
@@ -65,7 +66,7 @@ def test_cameras_are_those_of_the_same_capture(tmp_path: Path, program: str) -> 
         np.testing.assert_allclose(view.camera.viewmat, viewmat(ALL[view.name]), atol=1e-6)
     check_lens(scene, PROGRAMS[program].project)
     assert (scene.source, scene.warnings[1:] if program == "OpenSfM" else scene.warnings) == ("program", ())
-    if program in ("Bundler", "OpenSfM"):
+    if program in ("Bundler", "OpenSfM", "VisualSFM"):
         np.testing.assert_array_equal(scene.points[0], [1.5, 2.5, 3.5])
         np.testing.assert_array_equal(scene.colors[0], [10, 20, 30])
 
@@ -144,6 +145,8 @@ WRONG = {
     "no camera": ("OpenSfM", '{"v2 a": {', '{"v2 b": {', "which is missing"),
     "another version": ("Bundler", "v0.3", "v0.4", "version 0.3 is read"),
     "no number": ("Bundler", "530.0 ", "5e400 ", "not finite"),
+    "a calibration": ("VisualSFM", "NVM_V3 ", "NVM_V3 FixedK 9 4 9 3", "one calibration of all photos"),
+    "a negative focal length": ("VisualSFM", "\t530.0 ", "\t-530.0 ", "its focal length is -530"),
 }
 
 
@@ -194,6 +197,28 @@ def test_metashape_with_a_fourth_coefficient_and_with_a_fisheye_lens(tmp_path: P
     check_lens(loaded(tmp_path), project)
 
 
+def test_matrices_of_visualsfm(tmp_path: Path) -> None:
+    photos(tmp_path / "images", size=SIZE)
+    written.visualsfm(tmp_path, VIEWMATS, NAMES, matrix=True)
+    check(loaded(tmp_path), ALL)
+
+
+@pytest.mark.parametrize(("name", "each"), [("metadata.json", False), ("metadata", True)])
+def test_record3d_names_its_photos_by_their_numbers(tmp_path: Path, name: str, each: bool) -> None:
+    """As an export of photos, and as an unpacked .r3d."""
+    numbered = [f"{k}.jpg" for k in range(COUNT)]
+    photos(tmp_path / "rgbd", numbered, SIZE)
+    written.record3d(tmp_path / name, VIEWMATS, each=each)
+    scene = loaded(tmp_path)
+    assert [(view.name, view.image.name) for view in scene.views] == [
+        (f"rgbd/{each}", each) for each in sorted(numbered)
+    ]
+    for view in scene.views:
+        np.testing.assert_allclose(view.camera.viewmat, viewmat(int(view.image.stem)), atol=1e-9)
+        camera = view.camera
+        assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx(written.RECORD3D)
+
+
 def test_geocentric_cameras_are_moved_to_the_origin(tmp_path: Path) -> None:
     photos(tmp_path / "images", size=SIZE)
     far = np.eye(4)
@@ -238,6 +263,8 @@ STRAY = {
     "a.xmp": b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><crs:Exposure/></x:xmpmeta>',
     "reconstruction.json": b"{}",
     "wordlist.txt": b"a",
+    "a.nvm": b"x",
+    "metadata.json": b'{"title": "an album"}',
 }
 
 
@@ -251,18 +278,20 @@ def test_files_with_such_names_and_other_contents_are_no_cameras(tmp_path: Path)
         (tmp_path / name).rename(tmp_path / "poses" / name)
     (said,) = posed.without_cameras(tmp_path)
     assert said.startswith(
-        "No cameras of a program that is known (Metashape, RealityScan, OpenSfM, Bundler) are in"
+        "No cameras of a program that is known (Metashape, RealityScan, OpenSfM, Bundler, VisualSFM, Record3D) are in"
     )
 
 
 UNREAD = [
-    "scan.nvm",
     "scene.sfm",
     "poses_bounds.npy",
     "a.psx",
     "sfm_data.bin",
     "shots.geojson",
     "temple_par.txt",
+    "00000001_cam.txt",
+    "scan_calibrated_external_camera_parameters.txt",
+    "cameras_sphere.npz",
 ]
 
 

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from splatmill_worker.readers.programs.shots import (
     BROWN,
+    FLIP,
     MOST_SHOTS,
     Float,
     NoCameras,
@@ -25,9 +26,6 @@ from splatmill_worker.readers.programs.shots import (
     rotation_of,
     text_of,
 )
-
-FLIP = np.diag([1.0, -1.0, -1.0])
-"""Turns the axes of a camera from Bundler's to OpenCV's."""
 
 HEADER = "# Bundle file v0.3"
 

@@ -7,7 +7,15 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from splatmill_worker.readers.programs import bundler, metashape, opensfm, realityscan
+from splatmill.data_sets import fits
+from splatmill_worker.readers.programs import (
+    bundler,
+    metashape,
+    opensfm,
+    realityscan,
+    record3d,
+    visualsfm,
+)
 from splatmill_worker.readers.programs.shots import Shots
 
 HEAD = 64 * 2**10
@@ -19,31 +27,33 @@ class Kind:
     """A kind of files with cameras.
 
     program: that writes them, in a sentence.
-    suffixes: of their names, in lower case.
+    names: patterns of their names, in lower case.
     marks: texts of which all are in the beginning of a file, in lower case.
     read: reads the files of one data set.
     many: whether each photo has a file of its own.
     """
 
     program: str
-    suffixes: tuple[str, ...]
+    names: tuple[str, ...]
     marks: tuple[str, ...]
     read: Callable[[list[Path]], Shots]
     many: bool = False
 
 
 KINDS = (
-    Kind("Metashape", (".xml",), ("<chunk", "<sensors"), metashape.read),
-    Kind("RealityScan", (".csv",), ("heading", "pitch", "roll"), realityscan.read_csv),
+    Kind("Metashape", ("*.xml",), ("<chunk", "<sensors"), metashape.read),
+    Kind("RealityScan", ("*.csv",), ("heading", "pitch", "roll"), realityscan.read_csv),
     Kind(
         "RealityScan (XMP)",
-        (".xmp",),
+        ("*.xmp",),
         ("capturingreality.com/ns/xcr", "rotation"),
         realityscan.read_xmp,
         many=True,
     ),
-    Kind("OpenSfM", (".json",), ('"cameras"',), opensfm.read),
-    Kind("Bundler", (".out",), ("# bundle file",), bundler.read),
+    Kind("OpenSfM", ("reconstruction.json",), ('"cameras"',), opensfm.read),
+    Kind("Bundler", ("*.out",), ("# bundle file",), bundler.read),
+    Kind("VisualSFM", ("*.nvm",), ("nvm_v3",), visualsfm.read),
+    Kind("Record3D", ("metadata.json", "metadata"), ('"poses"', '"k"'), record3d.read),
 )
 """In order of preference, where a data set has cameras of several."""
 
@@ -54,8 +64,7 @@ def kind_of(path: Path) -> Kind | None:
         head = file.read(HEAD)
     # Text of UTF-16 has a zero beside each letter of ASCII.
     text = head.replace(b"\0", b"").decode("utf-8", "replace").lower()
-    suffix = path.suffix.lower()
-    kinds = (kind for kind in KINDS if suffix in kind.suffixes)
+    kinds = (kind for kind in KINDS if fits(path.name, kind.names))
     return next((kind for kind in kinds if all(mark in text for mark in kind.marks)), None)
 
 

@@ -23,10 +23,16 @@ MOST_SHOTS = 200_000
 MAX_SHEAR = 1e-3
 """Largest element of R^T R - 1 of a rotation that counts as rounding."""
 
+MAX_LENGTH_ERROR = 0.1
+"""Error of the length of a quaternion that counts as rounding, as to one decimal."""
+
 COPIES = 24
 """Times the size of a text that reading it takes, at most: JSON becomes lists of Python's numbers."""
 
 Float = npt.NDArray[np.float64]
+
+FLIP = np.diag([1.0, -1.0, -1.0])
+"""Turns the axes of a camera from those of OpenGL to those of OpenCV, and back."""
 
 PINHOLE, BROWN, RATIONAL = "PINHOLE", "OPENCV", "FULL_OPENCV"
 FISHEYE, FISHEYE_TANGENTIAL = "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE"
@@ -138,6 +144,23 @@ def rotation_of(matrix: Float) -> Float:
     return rotation
 
 
+def rotation_of_quaternion(w: float, x: float, y: float, z: float) -> Float:
+    """The rotation [3,3] of a quaternion whose length is 1, or was before it was rounded. Raises ValueError."""
+    length = math.hypot(w, x, y, z)
+    if not abs(length - 1.0) <= MAX_LENGTH_ERROR:
+        raise ValueError(
+            f"its quaternion ({w:.4g}, {x:.4g}, {y:.4g}, {z:.4g}) has the length {length:.4g}, and not 1"
+        )
+    w, x, y, z = w / length, x / length, y / length, z / length
+    return np.array(
+        [
+            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+            [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+            [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+        ]
+    )
+
+
 def pinhole_or(model: str, distortion: Iterable[float]) -> tuple[str, tuple[float, ...]]:
     """The model and its distortion; a pinhole's where there is none."""
     values = tuple(distortion)
@@ -162,7 +185,15 @@ def brown(
         return pinhole_or(BROWN, (k1, k2, *tangential))
     if not k4:
         return RATIONAL, (k1, k2, *tangential, k3, 0.0, 0.0, 0.0)
-    return RATIONAL, _ratio((k1, k2, k3, k4), reach, tangential)
+    radii = np.linspace(0.0, reach, 400)
+    factor = 1.0 + np.stack([radii ** (2 * order) for order in (1, 2, 3, 4)], axis=1) @ [k1, k2, k3, k4]
+    found = ratio(radii, factor)
+    if found is None:
+        raise ValueError(
+            f"its lens has a fourth radial coefficient, k4 = {k4:.4g}, which no camera model here has, and for which "
+            "no other coefficients can stand; align again without k4, or export undistorted photos"
+        )
+    return RATIONAL, (*found[:2], *tangential, *found[2:])
 
 
 MOST_DIFFERENT = 1e-5
@@ -170,24 +201,17 @@ MOST_DIFFERENT = 1e-5
 at a focal length of a thousand."""
 
 
-def _ratio(radial: Sequence[float], reach: float, tangential: tuple[float, float]) -> tuple[float, ...]:
-    radii = np.linspace(0.0, reach, 400)
-    squares = radii**2
-    factor = 1.0 + np.stack([squares ** (order + 1) for order in range(len(radial))], axis=1) @ np.array(
-        radial
-    )
-    powers = np.stack([squares, squares**2, squares**3], axis=1)
+def ratio(radii: Float, factor: Float) -> tuple[float, ...] | None:
+    """k1, k2, k3 above and k4, k5, k6 below the line, of the ratio of polynomials in the squared radius that stands for
+    a factor at some radii in order; None where none is as close as MOST_DIFFERENT."""
+    reach = radii[-1]
+    powers = np.stack([radii ** (2 * order) for order in (1, 2, 3)], axis=1)
     scale = np.array([reach**2, reach**4, reach**6])
     columns = np.hstack([powers / scale, -factor[:, None] * powers / scale])
     solution = np.linalg.lstsq(columns, factor - 1.0, rcond=1e-14)[0]
     upper, lower = solution[:3] / scale, solution[3:] / scale
     below = 1.0 + powers @ lower
-    error = (
-        np.abs(radii * ((1.0 + powers @ upper) / below - factor)).max() if (below > 0.1).all() else math.inf
-    )
-    if not error <= MOST_DIFFERENT:
-        raise ValueError(
-            f"its lens has a fourth radial coefficient, k4 = {radial[3]:.4g}, which no camera model here has, and for "
-            "which no other coefficients can stand; align again without k4, or export undistorted photos"
-        )
-    return (*upper[:2], *tangential, upper[2], *lower)
+    if not (below > 0.1).all():
+        return None
+    error = np.abs(radii * ((1.0 + powers @ upper) / below - factor)).max()
+    return (*upper.tolist(), *lower.tolist()) if error <= MOST_DIFFERENT else None

@@ -15,6 +15,7 @@ from splatmill_worker.errors import Refusal
 from splatmill_worker.images.decoding import decoders
 from splatmill_worker.readers import colmap_files
 from splatmill_worker.readers.colmap_files import Arrays
+from splatmill_worker.readers.programs.shots import rotation_of_quaternion
 from splatmill_worker.sfm.posed import camera_models
 from splatmill_worker.sfm.posed.camera_models import IntrinsicsNotInPixels
 
@@ -201,9 +202,12 @@ def _images(
                 f"The COLMAP model could not be read: {name!r} has the camera {of}, which is missing."
             )
         fault = ""
-        if not (abs(float(np.linalg.norm(quat)) - 1.0) < 1e-3):
-            fault = f"The rotation of {name!r} in the COLMAP model is not valid: {quat}."
-        elif not (np.abs(translation) <= MAX_DISTANCE).all():
+        viewmat = np.eye(4)
+        try:
+            viewmat[:3, :3] = rotation_of_quaternion(*quat.tolist())
+        except ValueError as error:
+            fault = f"The rotation of {name!r} in the COLMAP model is not valid: {error}."
+        if not fault and not (np.abs(translation) <= MAX_DISTANCE).all():
             fault = (
                 f"The translation of {name!r} in the COLMAP model is not valid, or too large: {translation}."
             )
@@ -212,8 +216,6 @@ def _images(
             if len(faulty) > MOST_FAULTY * len(names):
                 raise ValueError(faulty[0][1])
             continue
-        viewmat = np.eye(4)
-        viewmat[:3, :3] = pycolmap.Rotation3d(np.roll(quat / np.linalg.norm(quat), -1)).matrix()
         viewmat[:3, 3] = translation
         images[number] = GivenImage(name, cameras[of], viewmat)
     return images, tuple(faulty)
