@@ -84,9 +84,12 @@ def test_flat_gaussians_stay_and_broken_ones_go(tmp_path: Path) -> None:
     rows["mean"][2, 0] = np.nan
     rows["quat"][3] = 128
     (tmp_path / "m.splat").write_bytes(rows.tobytes())
-    found = splat.read(tmp_path / "m.splat").gaussians
-    assert found.count == 1
-    assert bool(torch.isfinite(found.log_scales).all())
+    found = splat.read(tmp_path / "m.splat")
+    assert found.gaussians.count == 1
+    assert bool(torch.isfinite(found.gaussians.log_scales).all())
+    assert found.notes == (
+        "Gaussians with a value that is not finite, or a quaternion of zeros, are left out: 3 of 4.",
+    )
 
 
 def test_what_is_no_splat_file_is_named(tmp_path: Path) -> None:

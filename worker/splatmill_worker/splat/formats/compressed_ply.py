@@ -26,7 +26,6 @@ from splatmill_worker.splat.formats.contents import (
     NO_OFFSET,
     Contents,
     Offset,
-    finite,
     logits,
 )
 from splatmill_worker.splat.gaussians import SH_C0, Gaussians
@@ -122,8 +121,8 @@ def decode(path: Path, document: PlyData) -> Contents:
         logit_opacities=logits(rgba[:, 3]),
         sh=torch.cat(coefficients, dim=1),
     )
-    return Contents(
-        finite(gaussians),
+    return Contents.of(
+        gaussians,
         ply_comments.offset_of(path, document),
         ply_comments.antialiased_of(document),
         (*ply_columns.rest_notes(degree or 0), *ply_comments.unknown_modes(document)),

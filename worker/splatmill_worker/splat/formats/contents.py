@@ -36,11 +36,21 @@ class Contents:
     antialiased: bool | None = None
     notes: tuple[str, ...] = ()
 
-
-def finite(gaussians: Gaussians) -> Gaussians:
-    """The rows whose every parameter is finite and whose quaternion has a direction."""
-    keep = gaussians.finite()
-    return gaussians if bool(keep.all()) else gaussians.select(keep)
+    @staticmethod
+    def of(
+        gaussians: Gaussians,
+        offset: Offset = NO_OFFSET,
+        antialiased: bool | None = None,
+        notes: tuple[str, ...] = (),
+    ) -> Contents:
+        """The contents without the rows of a file in which a value is not finite, or a quaternion has no direction."""
+        keep = gaussians.finite()
+        lost = gaussians.count - int(keep.sum())
+        if lost:
+            gaussians = gaussians.select(keep)
+            unfit = "Gaussians with a value that is not finite, or a quaternion of zeros, are left out"
+            notes = (*notes, f"{unfit}: {lost} of {len(keep)}.")
+        return Contents(gaussians, offset, antialiased, notes)
 
 
 def visible(gaussians: Gaussians) -> Gaussians:

@@ -24,7 +24,6 @@ from splatmill_worker.splat.formats.contents import (
     NO_OFFSET,
     Contents,
     Offset,
-    finite,
     logits,
     unit,
     visible,
@@ -168,8 +167,8 @@ def _contents(path: Path) -> Contents:
     extras = extras if isinstance(extras, dict) else {}
     x, y, z = (float(value) for value in extras.get("offset", NO_OFFSET))
     antialiased = extras.get("antialiased")
-    return Contents(
-        finite(turned_about_x(gaussians)),
+    return Contents.of(
+        turned_about_x(gaussians),
         (x, y, z),
         antialiased if isinstance(antialiased, bool) else None,
         rest_notes(4 if f"{EXTENSION}:SH_DEGREE_4_COEF_0" in attributes else degree),

@@ -17,7 +17,7 @@ import torch
 
 from splatmill_worker.errors import ModelUnreadable
 from splatmill_worker.readers.reader_memory import check, check_gaussians
-from splatmill_worker.splat.formats.contents import Contents, finite, logits
+from splatmill_worker.splat.formats.contents import Contents, logits
 from splatmill_worker.splat.formats.splat import log_scales
 from splatmill_worker.splat.gaussians import SH_C0, Gaussians
 
@@ -82,7 +82,7 @@ def read(path: Path) -> Contents:
         torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, 4), torch.zeros(0), torch.zeros(0, 1, 3)
     )
     padded = [part.padded(degree) for part in [empty, *parts]]
-    return Contents(finite(Gaussians(*(torch.cat(group) for group in zip(*padded, strict=True)))))
+    return Contents.of(Gaussians(*(torch.cat(group) for group in zip(*padded, strict=True))))
 
 
 def _sections(data: bytes) -> list[_Section]:

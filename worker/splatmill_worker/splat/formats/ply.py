@@ -13,7 +13,7 @@ from splatmill_worker.errors import ModelUnreadable
 from splatmill_worker.readers import ply_document
 from splatmill_worker.readers.reader_memory import check_gaussians
 from splatmill_worker.splat.formats import ply_columns, ply_comments
-from splatmill_worker.splat.formats.contents import NO_OFFSET, Contents, Offset, finite, unit, visible
+from splatmill_worker.splat.formats.contents import NO_OFFSET, Contents, Offset, unit, visible
 from splatmill_worker.splat.gaussians import Gaussians
 
 COMPRESSED_ELEMENTS = ("chunk", "sh")
@@ -106,8 +106,8 @@ def decode(path: Path, document: PlyData) -> Contents:
         gaussians, notes = ply_columns.gaussians_of(vertex)
     except ValueError as error:
         raise ModelUnreadable(f"{path.name} is not a 3D Gaussian .ply: {error}.") from error
-    return Contents(
-        finite(gaussians),
+    return Contents.of(
+        gaussians,
         ply_comments.offset_of(path, document),
         ply_comments.antialiased_of(document),
         (*notes, *ply_comments.unknown_modes(document)),

@@ -33,7 +33,6 @@ from splatmill_worker.splat.formats.contents import (
     NO_OFFSET,
     Contents,
     Offset,
-    finite,
     logits,
     unit,
     visible,
@@ -167,7 +166,7 @@ def read(path: Path) -> Contents:
     except UnusablePicture as error:
         raise ModelUnreadable(f"{path.name} cannot be read: {error.message}") from error
     except (*DAMAGED, OSError, ValueError, OverflowError, KeyError, TypeError, RecursionError) as error:
-        raise ModelUnreadable(f"{path.name} could not be read as a SOG model: {plain(error)}") from error
+        raise ModelUnreadable(f"{path.name} could not be read as a SOG model: {plain(error)}.") from error
 
 
 def importance(gaussians: Gaussians) -> Tensor:
@@ -299,7 +298,7 @@ def _contents(files: sog_files.Files) -> Contents:
     if isinstance(meta.get("splatmill"), dict):
         x, y, z = _numbers(meta["splatmill"]["offset"], 3).tolist()
         offset = (x, y, z)
-    return Contents(finite(gaussians), offset, _antialiased(meta))
+    return Contents.of(gaussians, offset, _antialiased(meta))
 
 
 def _antialiased(meta: dict[str, Any]) -> bool | None:

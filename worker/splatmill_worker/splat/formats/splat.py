@@ -12,7 +12,7 @@ import torch
 
 from splatmill_worker.errors import ModelUnreadable
 from splatmill_worker.readers.reader_memory import check_gaussians
-from splatmill_worker.splat.formats.contents import Contents, finite, logits
+from splatmill_worker.splat.formats.contents import Contents, logits
 from splatmill_worker.splat.gaussians import SH_C0, Gaussians
 
 ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
@@ -36,7 +36,7 @@ def read(path: Path) -> Contents:
         logit_opacities=logits(rgba[:, 3]),
         sh=((rgba[:, :3] - 0.5) / SH_C0)[:, None],
     )
-    return Contents(finite(gaussians))
+    return Contents.of(gaussians)
 
 
 def check(path: Path) -> None:

@@ -22,7 +22,7 @@ from splatmill.files import atomic_write
 from splatmill_worker.errors import ModelUnreadable
 from splatmill_worker.kernels.morton import morton_order
 from splatmill_worker.readers.reader_memory import check, check_gaussians
-from splatmill_worker.splat.formats.contents import NO_OFFSET, Contents, Offset, finite, logits, unit, visible
+from splatmill_worker.splat.formats.contents import NO_OFFSET, Contents, Offset, logits, unit, visible
 from splatmill_worker.splat.formats.expansion import Gunzip, unzstd
 from splatmill_worker.splat.formats.frames import turned_about_x
 from splatmill_worker.splat.formats.ply_columns import rest_notes
@@ -129,7 +129,7 @@ def read(path: Path) -> Contents:
     if frame == _RUB:
         gaussians = turned_about_x(gaussians)
     antialiased = bool(header.flags & _ANTIALIASED)
-    return Contents(finite(gaussians), antialiased=antialiased, notes=rest_notes(header.degree))
+    return Contents.of(gaussians, antialiased=antialiased, notes=rest_notes(header.degree))
 
 
 def _parsed(head: bytes, size: int) -> _Header:
