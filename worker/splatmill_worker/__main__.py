@@ -66,6 +66,7 @@ def main(argv: list[str] | None = None) -> int:
     mesh.add_argument("--faces", type=int, required=True, help="most triangles")
     mesh.add_argument("--voxel", type=float, help="side of a voxel, units of the model")
     mesh.add_argument("--box", help="lower and upper corner as JSON")
+    mesh.add_argument("--texture", type=int, help="longest side of a texture in pixels")
     mesh.add_argument("--up", default="-y", help="axis that points up, for a model without cameras")
     mesh.add_argument(
         "--backend", choices=["reference", "cpu", "gpu"], help="kernels to render with (default: cpu)"

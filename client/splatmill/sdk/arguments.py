@@ -91,6 +91,7 @@ class MeshArguments(TypedDict, total=False):
     faces: int
     voxel: float | None
     box: Box | Mapping[str, Any] | None
+    texture: int | None
 
 
 class PresentationArguments(TypedDict, total=False):

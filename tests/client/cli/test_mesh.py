@@ -26,6 +26,8 @@ def ball(tmp_path: Path) -> Path:
         (["--box", "0", "0", "0", "0", "1", "1"], "The box is empty"),
         (["--faces", "3"], "Invalid value for '--faces'"),
         (["--voxel", "0"], "Invalid value for '--voxel'"),
+        (["--texture", "100"], "Invalid value for '--texture'"),
+        (["-o", "out.ply", "--texture", "512"], "a .ply has no texture"),
     ],
 )
 def test_what_cannot_be_done_is_said_before_anything_runs(ball: Path, options: list[str], said: str) -> None:

@@ -146,11 +146,11 @@ def test_a_mesh_is_made_in_the_background_kept_and_found_again(
         write(name, record)
 
     monkeypatch.setattr(app.service.meshes, "_write", heard)
-    made = begun(app)
+    made = begun(app, texture=256)
     assert (made["state"], made["request"]["faces"], made.get("facts")) == ("queued", 2000, None)
     done = ended(app, made["id"])
     assert done["state"] == "succeeded", done
-    assert [p.stage for p in said][-1] == "colouring the surface"
+    assert [p.stage for p in said][-1] == "painting a texture"
     assert (12, 12) in {(p.done, p.total) for p in said if p.stage == "rendering depths"}
     assert done.get("progress") is None
     assert files(app) == [f"{made['id']}/mesh", f"{made['id']}/mesh.json"]
@@ -158,6 +158,7 @@ def test_a_mesh_is_made_in_the_background_kept_and_found_again(
     assert (file.status_code, file.headers["content-type"]) == (200, "model/gltf-binary")
     assert len(file.content) == done["bytes"]
     document, data = chunks(file.content)
+    assert [image["mimeType"] for image in document["images"]] == ["image/jpeg"]
     positions = values(document, data, 0, "<f4")
     triangles = document["accessors"][document["meshes"][0]["primitives"][0]["indices"]]["count"] // 3
     assert 1000 < triangles == done["facts"]["triangles"] <= 2000
@@ -169,7 +170,7 @@ def test_a_mesh_is_made_in_the_background_kept_and_found_again(
     head = app.http.head(done["links"]["file"])
     assert (head.headers["content-length"], head.content) == (str(done["bytes"]), b"")
 
-    again = app.http.post(MESHES, json=WISH | {"format": "glb"})  # which is the default
+    again = app.http.post(MESHES, json=WISH | {"texture": 256, "format": "glb"})  # the default
     assert (again.status_code, again.json()) == (200, done)
     cut = begun(app, format="ply", box={"min": [-2, -2, 0], "max": [1e9, 2, 2]})
     assert ended(app, cut["id"])["state"] == "succeeded"
@@ -259,7 +260,9 @@ async def _nothing() -> None:
         ({"voxel": "nan"}, "invalid_request"),
         ({"format": "obj"}, "invalid_request"),
         ({"box": {"min": [0, 0, 0], "max": [0, 1, 1]}}, "invalid_request"),
-        ({"texture": True}, "invalid_request"),
+        ({"texture": 100}, "invalid_request"),
+        ({"texture": 512, "format": "ply"}, "invalid_request"),
+        ({"gloss": True}, "invalid_request"),
     ],
 )
 def test_what_is_no_request_is_refused_at_once(app: ServedApp, changed: dict[str, Any], code: str) -> None:

@@ -27,6 +27,7 @@ def chosen(model: Path, out: Path, **options: Any) -> Namespace:
         "faces": 5000,
         "voxel": None,
         "box": None,
+        "texture": None,
         "cameras": None,
         "up": "z",
         "backend": None,
@@ -65,6 +66,16 @@ def test_the_cameras_beside_the_model_are_used(model: Path, capsys: pytest.Captu
     assert "from 12 views" in capsys.readouterr().out
     content, _ = chunks(out.read_bytes())
     assert content["meshes"][0]["primitives"][0]["extras"] == {"offset": [500.0, 0.0, -20.0]}
+    assert "textures" not in content
+
+
+def test_a_texture_stands_in_place_of_colours(model: Path) -> None:
+    model.with_name("cameras.json").write_text(document())
+    out = model.with_name("mesh.glb")
+    assert main(chosen(model, out, texture=256)) == 0
+    content, _ = chunks(out.read_bytes())
+    assert set(content["meshes"][0]["primitives"][0]["attributes"]) == {"POSITION", "TEXCOORD_0"}
+    assert len(content["textures"]) == 1
 
 
 def test_without_cameras_the_model_is_seen_from_rings(

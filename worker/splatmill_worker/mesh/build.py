@@ -16,6 +16,7 @@ from splatmill_worker.mesh.colors import colored
 from splatmill_worker.mesh.depths import View, confirmed, views_of
 from splatmill_worker.mesh.poisson import levels, reconstruct, side_of
 from splatmill_worker.mesh.samples import Corners, Region, samples_of
+from splatmill_worker.mesh.texture import textured
 from splatmill_worker.mesh.triangles import Mesh, simplified, without_specks
 from splatmill_worker.scene import Camera
 from splatmill_worker.splat.gaussians import Gaussians
@@ -56,11 +57,13 @@ class Wanted:
     faces: most triangles.
     voxel: largest side of the octree's finest cells, world units; None: FOOTPRINT, or what DEEPEST levels reach.
     box: lower and upper corner of the part of the world that is built; None: all of it within REACH.
+    texture: longest side of a texture in pixels; None: the vertices have colours.
     """
 
     faces: int
     voxel: float | None = None
     box: Corners | None = None
+    texture: int | None = None
 
 
 @dataclass(frozen=True)
@@ -125,7 +128,11 @@ def build(
     told(Progress(stage="simplifying the surface"))
     mesh = simplified(whole, wanted.faces)
     told(Progress(stage="colouring the surface"))
-    return Built(colored(mesh, views), len(views), middle, side_of(samples, depth), len(whole.faces))
+    mesh = colored(mesh, views)
+    if wanted.texture is not None:
+        told(Progress(stage="painting a texture"))
+        mesh = textured(mesh, views, wanted.texture)
+    return Built(mesh, len(views), middle, side_of(samples, depth), len(whole.faces))
 
 
 def chosen(cameras: Sequence[Camera]) -> list[Camera]:

@@ -13,7 +13,8 @@ from splatmill_worker.mesh.depths import AGREEMENT, View
 from splatmill_worker.mesh.triangles import Mesh
 
 SHARPEST = 4.0
-"""Power of the cosine between normal and ray in a view's weight: views from the front see the most detail."""
+"""Power of the cosine between normal and ray in a view's weight: views from the front see the most detail (decisions:
+SHARPEST)."""
 
 UNSEEN = 128
 """Grey level of vertices that no view sees and no coloured vertex is near to."""
@@ -25,18 +26,26 @@ SPREADINGS = 64
 def colored(mesh: Mesh, views: Sequence[View]) -> Mesh:
     """The mesh with the mean colour of each vertex in the views whose depth agrees with it, by how they face it."""
     points, normals = torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.normals())
+    mean, weight = blended(points, normals, views)
+    colors = _spread(mesh, mean, weight > 0)
+    return replace(mesh, colors=colors.round().to(torch.uint8).numpy())
+
+
+def blended(points: Tensor, normals: Tensor, views: Sequence[View]) -> tuple[Tensor, Tensor]:
+    """The mean colour [n, 3] of points [n, 3] with normals [n, 3] in the views whose depth agrees, by how these face
+    them; and the sum of the weights [n], which is 0 where no view sees a point."""
     total, weight = torch.zeros(len(points), 3), torch.zeros(len(points))
     for view in views:
         column, row, z = view.pixels(points)
-        center = torch.as_tensor(view.camera.center).float()
-        towards = torch.nn.functional.normalize(center - points, dim=1)
-        facing = (towards * normals).sum(1).clamp_min(0.0) ** SHARPEST
         agrees = (z > 0) & ((view.depth[row, column] - z).abs() < AGREEMENT * z)
-        share = torch.where(agrees, facing / z.square().clamp_min(1e-12), 0.0)
-        total += share[:, None] * view.color[row, column].float()
-        weight += share
-    colors = _spread(mesh, total / weight[:, None].clamp_min(1e-30), weight > 0)
-    return replace(mesh, colors=colors.round().to(torch.uint8).numpy())
+        seen = agrees.nonzero()[:, 0]
+        center = torch.as_tensor(view.camera.center).float()
+        towards = torch.nn.functional.normalize(center - points[seen], dim=1)
+        facing = (towards * normals[seen]).sum(1).clamp_min(0.0) ** SHARPEST
+        share = facing / z[seen].square().clamp_min(1e-12)
+        total[seen] += share[:, None] * view.color[row[seen], column[seen]].float()
+        weight[seen] += share
+    return total / weight[:, None].clamp_min(1e-30), weight
 
 
 def _spread(mesh: Mesh, colors: Tensor, known: Tensor) -> Tensor:

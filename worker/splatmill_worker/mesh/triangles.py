@@ -17,16 +17,20 @@ Ints = npt.NDArray[np.int32]
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangles with colours.
+    """Triangles with colours, or with a texture.
 
     vertices: [V, 3] float32, world units.
     faces: [F, 3] int32 indices of vertices, counter-clockwise seen from outside.
-    colors: [V, 3] uint8; None before they are measured.
+    colors: [V, 3] uint8; None before they are measured, and with a texture.
+    uvs: [V, 2] float32, where the vertices lie on the texture: its first row is at 0, its last at 1.
+    texture: [H, W, 3] uint8.
     """
 
     vertices: Floats
     faces: Ints
     colors: npt.NDArray[np.uint8] | None = None
+    uvs: Floats | None = None
+    texture: npt.NDArray[np.uint8] | None = None
 
     def only(self, kept: npt.NDArray[np.bool_]) -> Mesh:
         """The faces of a mask [F], with the vertices that they use."""

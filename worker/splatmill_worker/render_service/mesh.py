@@ -49,7 +49,7 @@ def main(chosen: argparse.Namespace) -> int:
         _serve(chosen.parent)
     told = _sent if chosen.parent is not None else _Lines().told
     box = None if chosen.box is None else Box.model_validate_json(chosen.box)
-    wanted = Wanted(chosen.faces, chosen.voxel, None if box is None else (box.min, box.max))
+    wanted = Wanted(chosen.faces, chosen.voxel, None if box is None else (box.min, box.max), chosen.texture)
     try:
         built = mesh_file(chosen.model, chosen.out, wanted, chosen.cameras, chosen.up, chosen.backend, told)
     except (ModelUnreadable, Refusal) as error:

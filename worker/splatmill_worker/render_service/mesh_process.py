@@ -100,6 +100,7 @@ class MeshMaker:
             *("--faces", str(request.faces), "--parent", str(os.getpid())),
             *(("--voxel", repr(request.voxel)) if request.voxel is not None else ()),
             *(("--box", request.box.model_dump_json()) if request.box is not None else ()),
+            *(("--texture", str(request.texture)) if request.texture is not None else ()),
             *(("--backend", self._backend) if self._backend is not None else ()),
             *("--", str(model)),
             stdin=asyncio.subprocess.DEVNULL,

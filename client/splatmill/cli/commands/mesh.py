@@ -39,6 +39,16 @@ def mesh(
             show_default=False,
         ),
     ] = None,
+    texture: Annotated[
+        int | None,
+        typer.Option(
+            metavar="PIXELS",
+            help="Longest side of a texture, of a .glb. Left out, each vertex has a colour instead.",
+            min=256,
+            max=8192,
+            show_default=False,
+        ),
+    ] = None,
     cameras: Annotated[
         Path | None,
         typer.Option(
@@ -51,7 +61,7 @@ def mesh(
     up: Up = None,
     server: ServerOption = None,
 ) -> None:
-    """Write a mesh of a model: the surfaces on which its cameras agree, with a colour at each vertex.
+    """Write a mesh of a model: the surfaces on which its cameras agree, with a colour at each vertex or a texture.
 
     A file is meshed on this machine. Ctrl-C cancels a mesh on the server.
     """
@@ -62,7 +72,12 @@ def mesh(
 
     if out.suffix.lower() not in SUFFIXES:
         raise typer.BadParameter(f"{out} must end in one of {', '.join(SUFFIXES)}.", param_hint="--out")
-    wish: dict[str, Any] = {"format": out.suffix.lower()[1:], "faces": faces, "voxel": voxel}
+    wish: dict[str, Any] = {
+        "format": out.suffix.lower()[1:],
+        "faces": faces,
+        "voxel": voxel,
+        "texture": texture,
+    }
     if box is not None:
         wish["box"] = {"min": box[:3], "max": box[3:]}
     try:
@@ -110,6 +125,8 @@ def _mesh_file(model: Path, out: Path, request: "MeshRequest", cameras: Path | N
         arguments += ["--box", request.box.model_dump_json()]
     if request.voxel is not None:
         arguments += ["--voxel", repr(request.voxel)]
+    if request.texture is not None:
+        arguments += ["--texture", str(request.texture)]
     if cameras is not None:
         arguments += ["--cameras", str(cameras)]
     require("splatmill_worker", "Making a mesh")

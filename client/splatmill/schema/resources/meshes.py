@@ -1,9 +1,9 @@
 """Meshes of a model that the server makes in the background and keeps with it."""
 
 from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, Self
 
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, model_validator
 
 from splatmill.schema.base import Request, Response
 from splatmill.schema.resources.edits import Box
@@ -19,7 +19,7 @@ class MeshFormat(StrEnum):
 
 
 class MeshRequest(Request):
-    """A mesh of a model: the surfaces on which its cameras agree, with a colour at each vertex."""
+    """A mesh of a model: the surfaces on which its cameras agree, with a colour at each vertex or with a texture."""
 
     format: MeshFormat = Field(default=MeshFormat.glb, description="File format.")
     faces: int = Field(default=500_000, ge=100, le=5_000_000, description="Most triangles.")
@@ -30,6 +30,18 @@ class MeshRequest(Request):
         description="Finest detail, in units of the model. Left out, the size of a pixel at the median depth.",
     )
     box: Box | None = Field(default=None, description="Only what lies in it is built.")
+    texture: int | None = Field(
+        default=None,
+        ge=256,
+        le=8192,
+        description="Longest side of a texture in pixels, of a .glb. Left out, each vertex has a colour instead.",
+    )
+
+    @model_validator(mode="after")
+    def _drawable(self) -> Self:
+        if self.texture is not None and self.format is not MeshFormat.glb:
+            raise ValueError(f"a .{self.format} has no texture: ask for a .glb, or leave out texture")
+        return self
 
 
 class MeshFacts(Response):

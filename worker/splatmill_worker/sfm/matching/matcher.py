@@ -52,7 +52,7 @@ class Matcher:
             count if (limit := limits[index]) is None else min(count, limit)
             for index, count in enumerate(counts)
         ]
-        most = max(1, *self._most, 1)
+        most = max([1, *self._most])
         # Two are compared at a time in each thread.
         self._directions = lru_cache(max(2, CACHED_BYTES // (most * 128 * 4)))(self._directions_of)
 

@@ -18,7 +18,7 @@ from splatmill.files import replacing
 
 MAGIC, VERSION, JSON, BIN = b"glTF", 2, b"JSON", b"BIN\0"
 ASSET = {"version": "2.0", "generator": "Splatmill"}
-TYPES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+TYPES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 COMPONENTS: dict[int, tuple[str, float]] = {
     5120: ("<i1", 127),
     5121: ("<u1", 255),
@@ -49,7 +49,7 @@ class Parts:
         normalized: bool = False,
         indices: bool = False,
     ) -> int:
-        """Append [N, 1, 3 or 4] values, in rows of a multiple of four bytes, and return their accessor's index."""
+        """Append [N, 1 to 4] values, in rows of a multiple of four bytes, and return their accessor's index."""
         array = np.ascontiguousarray(values)
         accessor: dict[str, Any] = {
             "bufferView": len(self.views),
@@ -62,13 +62,21 @@ class Parts:
         if bounds and array.shape[0]:
             accessor |= {"min": array.min(0).tolist(), "max": array.max(0).tolist()}
         target = _INDICES if indices else _ATTRIBUTES
-        self.views.append(
-            {"buffer": 0, "byteOffset": self.length, "byteLength": array.nbytes, "target": target}
-        )
+        self._append(array, target=target)
         self.accessors.append(accessor)
-        self.arrays.append(array)
-        self.length += array.nbytes  # a multiple of four, as glTF asks for
         return len(self.accessors) - 1
+
+    def add_file(self, contents: bytes) -> int:
+        """Append a file, such as a picture, and return its buffer view's index."""
+        self._append(np.frombuffer(contents + bytes(-len(contents) % 4), np.uint8), size=len(contents))
+        return len(self.views) - 1
+
+    def _append(self, array: npt.NDArray[Any], *, size: int | None = None, target: int | None = None) -> None:
+        """Append an array, of which `size` bytes count, with a multiple of four bytes, as glTF asks for."""
+        view = {"buffer": 0, "byteOffset": self.length, "byteLength": array.nbytes if size is None else size}
+        self.views.append(view if target is None else view | {"target": target})
+        self.arrays.append(array)
+        self.length += array.nbytes
 
     def document(self) -> dict[str, Any]:
         """The members of a document that describe the parts."""
