@@ -16,6 +16,9 @@ from splatmill_server.space.quota import Arrival
 STALE = ("time_lapse", "views", "disagreement", "misfits", "warnings")
 """Parts of a training's report that an edited model has not."""
 
+_LONGEST_NAME = 200
+"""Characters of a name, as `Label` allows."""
+
 UNMEASURED = ("mse", "psnr_color_fitted", "lpips_vgg", "lpips_alex")
 """Scores of held-out photos that the renderer does not measure of an edited model."""
 
@@ -56,7 +59,7 @@ def _store_others(
     for entry in storage.entries(layout.model_file(model_id, HELD_OUT)):
         name = entry.path.removeprefix(layout.model(model_id) + "/")
         put(name, storage.get(entry.path))
-    scores = {view.name: view for view in edited.views}
+    scores = {} if request.crops else {view.name: view for view in edited.views}
     cameras = _read(storage, model_id, "cameras.json")
     if cameras:
         for row in cameras.get("cameras", []):
@@ -74,7 +77,7 @@ def _store_others(
     record |= {
         "id": new_id,
         "model": new_id,
-        "name": request.name or job.name,
+        "name": request.name or _name(job.name, request),
         "tags": job.tags,
         "favourite": False,
         "created_at": moment,
@@ -87,13 +90,14 @@ def _store_others(
 def _edited_report(
     report: dict[str, Any], model_id: str, request: EditModel, edited: Edited
 ) -> dict[str, Any]:
-    """The report of the training, with the last point of its curve and the result as they are after the edit."""
+    """The report of the training, with the last point of its curve and the result as they are after the edit.
+
+    The photos show what a crop has left out, so that the scores of a crop are no measure of its quality: they stand
+    under `edit` alone.
+    """
     ssims = [view.ssim for view in edited.views if view.ssim is not None]
-    measured = {
-        "gaussians": edited.gaussians,
-        "psnr": edited.psnr,
-        "ssim": sum(ssims) / len(ssims) if ssims else None,
-    }
+    scores = {"psnr": edited.psnr, "ssim": sum(ssims) / len(ssims) if ssims else None}
+    measured = {"gaussians": edited.gaussians, **(dict.fromkeys(scores) if request.crops else scores)}
     last = (report.get("curve") or [{"seconds": 0.0, "step": 0}])[-1]
     done = request.model_dump(mode="json", exclude_none=True, exclude={"name", "preview", "selection"})
     if request.selection is not None:
@@ -103,8 +107,14 @@ def _edited_report(
         "seconds": report.get("seconds") or {},
         "curve": [last | measured],
         "result": {**(report.get("result") or {}), **dict.fromkeys(UNMEASURED), **measured},
-        "edit": {"model": model_id, **done, "psnr_before": edited.psnr_before},
+        "edit": {"model": model_id, **done, "psnr_before": edited.psnr_before, "psnr": edited.psnr},
     }
+
+
+def _name(name: str | None, request: EditModel) -> str | None:
+    """The name of an edited model where none is asked for."""
+    what = ", cropped" if request.crops else ", cleaned"
+    return name and name[: _LONGEST_NAME - len(what)] + what
 
 
 def _read(storage: Storage, model_id: str, name: str) -> dict[str, Any]:

@@ -184,6 +184,11 @@ def test_a_whole_job_is_watched_from_its_beginning_to_its_model(
     expect(link).to_have_attribute("href", f"/models/{job_id}")
     job, report = service.job(job_id), service.http.get(f"/v1/jobs/{job_id}/report").json()
     assert report["seconds"]["live"] > 0
+    details = page.get_by_role("heading", name=re.compile("What was decided|Seconds by stage|Log"))
+    expect(details.locator("visible=true")).to_have_count(0)
+    page.get_by_text("Details: what was decided").click()
+    expect(details.locator("visible=true")).to_have_count(3)
+    expect(page.locator("#facts")).to_contain_text("Time for training alone")
     for sentence in [*job["plan"]["reasons"].values(), *job["plan"]["left_out"].values()]:
         assert page.get_by_text(sentence, exact=True).count() >= 1, sentence
     rows = service.http.get(f"/v1/jobs/{job_id}/curve").json()["rows"]

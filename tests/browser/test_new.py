@@ -364,14 +364,23 @@ def test_settings_have_the_help_of_the_command_line_and_errors_beside_them(
     expect(page.locator("#option-image_size-error")).to_be_empty()
     expect(size).not_to_have_attribute("aria-invalid", "true")
     page.get_by_text("All settings").click()
-    page.get_by_label("Time budget").fill("soon")
+    # What the two times are for is seen where they are typed, and in what is expected of them.
+    for name, words in (
+        ("within", "About 2 min for everything"),
+        ("time_budget", "About 2 min for the training alone"),
+    ):
+        field = page.locator(f"#option-{name}")
+        field.fill("2m")
+        expect(page.locator("#estimate")).to_contain_text(words)
+        field.fill("")
+    page.get_by_label("Time for training alone").fill("soon")
     expect(page.locator("#option-time_budget-error")).to_contain_text("'soon' is not a duration")
     # Nothing is sent with settings that are not valid: the reason stands beside the button, which leads to the field.
     page.locator("#settings-all summary").click()
     page.get_by_role("button", name="Upload and train").click()
-    expect(page.locator("#problem")).to_contain_text("Time budget: 'soon' is not a duration")
-    expect(page.get_by_label("Time budget")).to_be_focused()
-    expect(page.get_by_label("Time budget")).to_be_in_viewport()
+    expect(page.locator("#problem")).to_contain_text("Time for training alone: 'soon' is not a duration")
+    expect(page.get_by_label("Time for training alone")).to_be_focused()
+    expect(page.get_by_label("Time for training alone")).to_be_in_viewport()
     expect(page.get_by_role("button", name="Upload and train")).to_be_enabled()
 
 
@@ -402,7 +411,7 @@ def test_a_further_job_on_stored_photos_with_an_estimate(
     page.locator("html[data-ready]").wait_for()
     assert page.url.endswith(f"/?capture={model.capture}")
     expect(page.locator("#place")).to_contain_text("still life: 15 files")
-    expect(page.locator("#estimate")).to_contain_text(re.compile("About .+ for 14 photos"))
+    expect(page.locator("#estimate")).to_contain_text(re.compile("About .+ for everything, with 14 photos"))
     page.get_by_text("How this was derived").click()
     expect(page.locator("#estimate")).to_contain_text("per step")
     ranges = """async (given) => (await import("/page/any/new/estimate.js")).range(given).join("")"""
@@ -454,12 +463,12 @@ def test_everything_works_by_keyboard(visit: Visit, service: Up, photos: Path, j
         page.keyboard.press("Enter")
     chooser.value.set_files(sorted(photos.iterdir())[:4])
     expect(page.locator('.photo[data-verdict="good"]')).to_have_count(4, timeout=CHECKED)
-    tab_to(page, '[aria-label="Leave out still_02.jpg"]')
-    page.keyboard.press("Enter")
-    expect(page.locator('[aria-label="Use still_02.jpg"]')).to_be_focused()
     tab_to(page, '[name="preset"]')
     page.keyboard.press("ArrowLeft")
     expect(page.locator('[name="preset"]:checked')).to_have_value("draft")
+    tab_to(page, '[aria-label="Leave out still_02.jpg"]')
+    page.keyboard.press("Enter")
+    expect(page.locator('[aria-label="Use still_02.jpg"]')).to_be_focused()
     tab_to(page, "#start")
     page.keyboard.press("Enter")
     job = started(page, service)
@@ -510,10 +519,14 @@ def test_a_scene_is_called_as_its_folder_or_its_day_until_somebody_names_it(
 def test_empty_lists_leave_no_gap_above_the_photos(page: Page, photos: Path) -> None:
     give(opened(page), *sorted(photos.iterdir()))
     page.evaluate("document.getElementById('remarks').replaceChildren()")
-    tools, tiles = (page.locator(f"#{name}").bounding_box() for name in ("tools", "photos"))
+    tools, settings, tiles = (
+        page.locator(f"#{name}").bounding_box() for name in ("tools", "settings", "photos")
+    )
     assert tools is not None
+    assert settings is not None
     assert tiles is not None
-    assert tiles["y"] - tools["y"] - tools["height"] < 24, "one distance of the stack, and not three"
+    for above, below in ((tools, settings), (settings, tiles)):
+        assert 0 < below["y"] - above["y"] - above["height"] < 24, "one distance of the stack, and not three"
 
 
 def test_axe_finds_nothing_serious(service: Up, open_window: Open, photos: Path) -> None:

@@ -44,7 +44,8 @@ class EditModel(Request):
         default=None, description="Gaussians that were selected on views of the model are left out."
     )
     name: Label | None = Field(
-        default=None, description="Name of the new model. Left out, that of the model."
+        default=None,
+        description="Name of the new model. Left out, that of the model with `, cropped` or `, cleaned` after it.",
     )
     preview: bool = Field(default=False, description="Only measure what the edit does; no model is made.")
 
@@ -53,6 +54,11 @@ class EditModel(Request):
         if all(part is None for part in (self.box, self.min_opacity, self.max_size, self.selection)):
             raise ValueError("The edit leaves nothing out: give box, min_opacity, max_size or selection.")
         return self
+
+    @property
+    def crops(self) -> bool:
+        """Whether a part of the scene is left out, which the photos still show: they do not measure what is left."""
+        return self.box is not None or self.selection is not None
 
 
 class EditedView(Response):

@@ -3,9 +3,11 @@
 import { Problem, follow, get, idOfPage, send } from "../api.js";
 import { ErrorChart } from "../chart.js";
 import { byId, h } from "../dom.js";
-import { bytes, count, decibels, moment, number, seconds } from "../format.js";
+import { figures } from "../figures.js";
+import { bytes, count, moment, number, seconds } from "../format.js";
 import { FINAL, badgeKind, badgeText } from "../job_states.js";
 import { labelButton, starButton, tagLinks } from "../labels.js";
+import { titleOf } from "../new/titles.js";
 import { confirmAction, noticeOf, notify, startShell } from "../shell.js";
 import { Course, stageName } from "./course.js";
 import { LiveScene } from "./live_scene.js";
@@ -173,7 +175,7 @@ function draw() {
     showState();
     watching.check();
   }
-  document.title = `${titleOf()} - Splatmill`;
+  document.title = `${pageTitle()} - Splatmill`;
   showTimeline(byId("stages"), course, Date.now());
   byId("left").textContent = course.final ? "" : sentenceOf(secondsLeft(course, estimate, Date.now()));
   if (shown.rows !== course.rows) {
@@ -206,7 +208,7 @@ function draw() {
   }
 }
 
-function titleOf() {
+function pageTitle() {
   const name = job.name || `Job ${id}`;
   const { progress } = course;
   if (course.final || !progress?.total) return `${name}: ${badgeText(course.state, false).toLowerCase()}`;
@@ -227,6 +229,7 @@ function showState() {
   byId("live-card").hidden = early && !course.previews && !course.cameras && !placement && !course.snapshot;
   byId("curve-card").hidden = early && !course.rows.length;
   for (const name of ["watch", "watch-hint"]) byId(name).closest(name === "watch" ? "label" : "p")?.toggleAttribute("hidden", over);
+  if (course.state === "failed") byId("details").setAttribute("open", ""); // the log says how far it came
   showSeconds();
   if (course.state === "queued") setTimeout(() => { if (job && course.state === "queued") refresh(); }, QUEUE_MS);
 }
@@ -243,8 +246,8 @@ function showOutcome() {
 function outcome() {
   if (course.state === "succeeded") {
     const result = report?.result;
-    const words = result?.psnr ? `The model is finished: ${decibels(result.psnr)} on photos that training did not see, ${number(result.gaussians)} Gaussians.` : "The model is finished.";
-    const box = noticeOf(words, "good");
+    const box = noticeOf("The model is finished.", "good");
+    if (result) box.append(h("p", {}, figures(result)));
     box.append(h("p", { class: "row" }, h("a", { class: "button primary", href: `/models/${encodeURIComponent(job.model ?? id)}` }, "Open the model"),
       report && h("a", { href: `/v1/models/${encodeURIComponent(job.model ?? id)}/files/report.html` }, "Report")));
     return [box];
@@ -332,7 +335,7 @@ function facts() {
     const setting = set.find(([key]) => key === name);
     if (!setting) continue;
     const [, value] = setting;
-    rows.push([name.replaceAll("_", " "), name === "time_budget" || name === "within" ? seconds(value) : typeof value === "number" ? number(value) : String(value)]);
+    rows.push([titleOf(name), name === "time_budget" || name === "within" ? seconds(value) : typeof value === "number" ? number(value) : String(value)]);
   }
   if (report?.peak_memory) rows.push(["Memory", `${bytes(report.peak_memory)} at most`]);
   rows.push(["Capture", h("code", {}, job.capture)]);

@@ -97,7 +97,7 @@ export class LiveScene {
     const parts = [];
     if (this.kind === "scene" && this.event) {
       const { step, gaussians, shown, bytes: size } = this.event;
-      parts.push(`Snapshot at step ${number(step)}: ${number(gaussians)} Gaussians, ${bytes(size)}, without view-dependent colour.`);
+      parts.push(`The scene after ${number(step)} steps: ${number(gaussians)} Gaussians, ${bytes(size)}, still without the gloss of surfaces.`);
       if (shown < 0.9 * gaussians) parts.push(`The ${number(shown)} that cover the most are shown.`);
     }
     if (this.kind === "picture") parts.push("The newest picture that the training made of itself.", this.trouble);

@@ -4,6 +4,7 @@ import { at } from "../address.js";
 import { get, modelAddress } from "../api.js";
 import { putInBin } from "../bin.js";
 import { append, byId, h } from "../dom.js";
+import { qualityOf } from "../figures.js";
 import { ago, bytes, decibels, moment, number } from "../format.js";
 import { exampleOffer } from "../example.js";
 import { starButton, tagLinks } from "../labels.js";
@@ -23,7 +24,7 @@ function entry(model) {
       : h("div", { class: "poster none", "aria-hidden": "true" }, "no picture"),
     h("div", { class: "body" },
       h("a", { class: "whole", href: `/models/${model.id}` }, name),
-      h("p", { class: "figures" }, `${decibels(model.psnr)} · ${number(model.gaussians)} Gaussians · ${bytes(model.bytes)}`),
+      h("p", { class: "figures" }, `${(model.psnr ?? null) === null ? "quality not measured" : `${qualityOf(model.psnr)}, ${decibels(model.psnr)}`} · ${number(model.gaussians)} Gaussians · ${bytes(model.bytes)}`),
       tagLinks(model, "/models"),
       h("div", { class: "foot" },
         h("span", { title: moment(model.created_at) }, ago(model.created_at)),

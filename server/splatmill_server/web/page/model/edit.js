@@ -5,7 +5,7 @@ import { send } from "../api.js";
 import { h, toggle } from "../dom.js";
 import { number } from "../format.js";
 import { noticeOf } from "../shell.js";
-import { BoxHandles, boxAround } from "../viewer/box_handles.js";
+import { BoxHandles, boxAround, boxOf } from "../viewer/box_handles.js";
 import { LOADING } from "../viewer/errors.js";
 import { Selecting } from "./selecting.js";
 
@@ -19,8 +19,10 @@ import { Selecting } from "./selecting.js";
 /** The axes of a model, and their directions where its frame.json says how they were chosen. */
 const AXES = ["x", "y", "z"];
 const DIRECTED = ["x, to the right", "y, downwards", "z, to the front"];
-/** Length of the box at first, over the width or height that is in sight where the view turns about. */
-const SHARE = 0.5;
+/** The box is laid around what lies nearer to where the view turns about than the camera does, over its distance. */
+const REACH = 0.8;
+/** Where the server draws: length of the box over the width or height that is in sight there. */
+const SHARE = 0.9;
 
 export class Edit {
   /** @param {Stage} stage */
@@ -80,7 +82,7 @@ export class Edit {
         h("div", { class: "field" }, h("label", { for: "edit-look" }, "What is left out is"), this.look)),
       h("div", { class: "row" }, this.measureButton, this.makeButton, this.undoButton),
       this.state,
-      h("p", { class: "hint" }, "This model is kept. The error is measured on up to 16 held-out photos, which show what lies outside of a box, so a crop raises it."));
+      h("p", { class: "hint" }, "This model is kept. What opacity and size do is measured on up to 16 held-out photos. They show what a box or a selection leaves out, so they do not measure the quality of a crop."));
   }
 
   /** @param {View} view */
@@ -88,7 +90,7 @@ export class Edit {
     this.view = view;
     if (!this.began) {
       const { width, height } = view.getCamera();
-      this.box = boxAround(view.focus, SHARE * view.distance * Math.tan(view.fovY / 2) * Math.min(1, width / height));
+      this.box = (view.points && boxOf(view.points, view.focus, REACH * view.distance)) ?? boxAround(view.focus, SHARE * view.distance * Math.tan(view.fovY / 2) * Math.min(1, width / height));
       this.began = true;
     }
     this.handles?.dispose();
@@ -206,7 +208,7 @@ export class Edit {
     this.state.replaceChildren(h("p", { class: "hint" }, "The server renders the held-out photos before and after."));
     try {
       const done = await send("POST", `${this.stage.shown.address}/edits`, edit);
-      this.state.replaceChildren(h("p", { class: "number" }, said(done)),
+      this.state.replaceChildren(h("p", { class: "number" }, said(done, Boolean(edit.box ?? edit.selection))),
         done.model ? h("p", {}, h("a", { href: `/models/${encodeURIComponent(done.model)}` }, "Open the new model")) : "");
     } catch (error) {
       this.state.replaceChildren(noticeOf(/** @type {Error} */ (error)));
@@ -216,10 +218,11 @@ export class Edit {
   }
 }
 
-/** @param {any} done the answer of the server */
-function said(done) {
+/** @param {any} done the answer of the server @param {boolean} crops whether a part of the scene is left out */
+function said(done, crops) {
   const gone = done.gaussians_before - done.gaussians;
   const error = done.psnr === null ? "there are no photos to measure it on"
+    : crops ? "the photos show what is left out, so they do not measure what is left"
     : `${done.psnr_before.toFixed(2)} dB before, ${done.psnr.toFixed(2)} dB after`;
   return `${number(gone)} of ${number(done.gaussians_before)} Gaussians ${done.model ? "are left out" : "would be left out"}: ${error}.`;
 }

@@ -20,5 +20,6 @@ export async function originOf(report) {
   const without = parts.length > 1 ? `${parts.slice(0, -1).join(", ")} and ${parts.at(-1)}` : parts[0];
   return h("p", { class: "hint", id: "origin" }, "Made from ",
     first ? h("a", { href: `/models/${encodeURIComponent(edit.model)}` }, first.name || `Model ${edit.model}`) : "a model that was deleted",
-    ` without ${without}. The training, its photos and its cameras are those of that model.`);
+    ` without ${without}. The training, its photos and its cameras are those of that model.`,
+    (edit.box || edit.selection) && " The photos show what was left out, so they do not measure the quality of what is left.");
 }

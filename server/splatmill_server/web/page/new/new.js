@@ -173,7 +173,7 @@ function redraw() {
   gallery.show(items);
   const any = items.all.length > 0;
   const usable = items.used.length > 0 || start.held.length > 0;
-  byId("given").hidden = !any;
+  byId("given").hidden = byId("cards").hidden = !any;
   byId("settings").hidden = byId("go").hidden = !usable;
   byId("drop").classList.toggle("small-drop", any);
   byId("example").hidden ||= any;
@@ -225,7 +225,7 @@ async function estimate() {
     showProblem(null);
     byId("estimate").replaceChildren(items.lacking ? h("p", { class: "error" }, items.lacking) : photos === null
       ? h("p", {}, "How long it will take is not known: the server has yet to count the photos in the archive.")
-      : estimateOf(estimate, photos, info.queued));
+      : estimateOf(estimate, photos, info.queued, values));
   } catch (error) {
     if (!(error instanceof Problem) || asked !== question) return;
     asked = "";

@@ -2,6 +2,7 @@
 
 import { h } from "../dom.js";
 import { number } from "../format.js";
+import { titleOf } from "./titles.js";
 
 /**
  * @typedef {object} Option
@@ -23,9 +24,6 @@ const GROUPS = { budget: "Length and size of the training", photos: "Photos", ca
 
 /** What can be typed, by type. */
 const EXAMPLES = { duration: "for example 90s, 5m or 1h30m", bytes: "for example 1.5GB", list: "one in each line" };
-
-/** @type {Record<string, string>} */
-const ABBREVIATIONS = { psnr: "PSNR", sfm: "SfM", sh: "SH" };
 
 const NUMBER = /^-?\d+(\.\d+)?$/;
 
@@ -186,12 +184,6 @@ export class OptionsForm {
     return h("fieldset", { class: "choice", "aria-describedby": `${help.id} ${error.id}` }, h("legend", {}, label),
       h("div", { class: "segments" }, inputs.map((input) => h("label", {}, input, h("span", {}, input.value)))), help, error);
   }
-}
-
-/** The name of a setting in words. @param {string} name */
-function titleOf(name) {
-  const words = name.split("_").map((word) => ABBREVIATIONS[word] ?? word).join(" ");
-  return words.replace(/^./, (letter) => letter.toUpperCase());
 }
 
 /** @param {Option} option */

@@ -12,6 +12,11 @@ const KEY_STEP = 0.02;
 /** Least length of a side over the greatest length of the box: a box never turns inside out. */
 const LEAST = 1e-3;
 const AXES = ["x", "y", "z"];
+/** Points that a box is laid around at most and at least, the share of them beyond each side, and the room left over its length. */
+const MOST_POINTS = 50_000;
+const FEWEST = 10;
+const OUTLIERS = 0.005;
+const ROOM = 0.03;
 
 export class BoxHandles {
   /**
@@ -114,6 +119,30 @@ export class BoxHandles {
   dispose() {
     this.element.remove();
   }
+}
+
+/**
+ * The box around the points that lie up to a distance from another, but for the outermost of them on each side: single
+ * Gaussians float far from all others. Null where there are too few.
+ * @param {Float32Array} points  x, y and z in turn @param {Vec} middle @param {number} reach @returns {Box | null}
+ */
+export function boxOf(points, middle, reach) {
+  /** @type {[number[], number[], number[]]} */
+  const values = [[], [], []];
+  const step = 3 * Math.ceil(points.length / 3 / MOST_POINTS);
+  for (let i = 0; i < points.length; i += step) {
+    if (Math.hypot(...middle.map((at, axis) => points[i + axis] - at)) <= reach) values.forEach((some, axis) => some.push(points[i + axis]));
+  }
+  const count = values[0].length;
+  if (count < FEWEST) return null;
+  const outside = Math.floor(OUTLIERS * count);
+  const ends = values.map((some) => {
+    some.sort((a, b) => a - b);
+    const [low, high] = [some[outside], some[count - 1 - outside]];
+    const room = ROOM * (high - low) || ROOM * reach;
+    return [low - room, high + room];
+  });
+  return { min: /** @type {Vec} */ (ends.map(([low]) => low)), max: /** @type {Vec} */ (ends.map(([, high]) => high)) };
 }
 
 /** A box around a point. @param {Vec} middle @param {number} half  of its sides' length @returns {Box} */
