@@ -21,9 +21,11 @@ from PIL import Image, ImageFilter
 from playwright.sync_api import Locator, Page, Request, expect
 
 from splatmill.schema import MIN_PHOTOS, describe_options
+from splatmill_worker.images.panoramas import by_edges, stated
 from splatmill_worker.images.prepare import prepare
 from tests.browser.conftest import Open, SmallModel, Visit
 from tests.support import still_life
+from tests.support.panoramas import gpano, striped
 from tests.support.programs import npm_package
 from tests.support.up import Up
 
@@ -134,6 +136,38 @@ def test_photos_of_one_kind_are_not_told_apart(page: Page, photos: Path, tmp_pat
     opened(page)
     give(page, tmp_path)
     expect(page.locator('.photo[data-verdict="bad"]')).to_have_count(0)
+
+
+def test_a_panorama_is_known_before_the_upload(page: Page, photos: Path, tmp_path: Path) -> None:
+    given = tmp_path / "given"
+    of_all = {"ProjectionType": "equirectangular"}
+    part = of_all | {
+        f"{name}HeightPixels": size for name, size in (("CroppedAreaImage", 115), ("FullPano", 256))
+    }
+    striped(given / "stated.jpg", gpano(**of_all), seed=1)
+    striped(given / "edges.jpg", seed=3)
+    striped(given / "part.jpg", gpano(**part), seed=5)
+    striped(given / "cylinder.jpg", gpano(ProjectionType="cylindrical"), seed=7)
+    first = sorted(photos.iterdir())[0]
+    Image.open(first).resize((512, 256)).save(given / "wide.jpg")
+    # The worker decides alike.
+    reasons = {}
+    for path in given.iterdir():
+        with Image.open(path) as image:
+            reasons[path.stem] = stated(image) or by_edges(image)
+    assert (reasons["stated"], reasons["edges"], reasons["wide"]) == ("stated", "closed", "")
+    give(opened(page), given)
+    for name in ("stated", "edges"):
+        verdict = tile(page, f"{name}.jpg").locator(".verdict")
+        expect(verdict).to_have_text("360-degree photo: it is cut into six views.")
+    expect(tile(page, "wide.jpg")).not_to_contain_text("360")
+    for name, words in (
+        ("part", "100% of its width and 45% of its height"),
+        ("cylinder", "cylindrical by its"),
+    ):
+        assert words in reasons[name]
+        expect(tile(page, f"{name}.jpg").locator(".verdict")).to_contain_text(words)
+        expect(tile(page, f"{name}.jpg")).to_have_attribute("data-verdict", "bad")
 
 
 def test_what_the_job_would_warn_of_is_said_before_the_upload(

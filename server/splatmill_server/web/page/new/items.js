@@ -20,6 +20,7 @@ import { verdicts } from "./looking/verdicts.js";
  * @property {number} width
  * @property {number} height
  * @property {import("./looking/measure.js").Measures | null} measures
+ * @property {import("./looking/verdicts.js").Verdict | null} panorama
  * @property {Uint32Array | null} levels number of pixels of each level of a mask; null while not known
  * @property {string | null} thumbnail address
  * @property {Blob | null} picture what lies there
@@ -83,7 +84,7 @@ export class Items {
       /** @type {Item} */
       const item = {
         id: ++this.count, path: free, file, role: null, name: free, kind: "ignored", named: false, left: false, digest: null, state: "waiting", width: 0, height: 0,
-        measures: null, levels: null, thumbnail: null, picture: null, lost: null, inside: null, verdict: { kind: "waiting", text: "" }, stored: false, problem: null,
+        measures: null, levels: null, panorama: null, thumbnail: null, picture: null, lost: null, inside: null, verdict: { kind: "waiting", text: "" }, stored: false, problem: null,
       };
       this.byPath.set(free, item);
       added.push(item);

@@ -2,6 +2,7 @@
 
 import { sha256 } from "./digest.js";
 import { MEASURED_SIDE, levels, measure } from "./measure.js";
+import { SIZE, XMP_BYTES, panoramaOf } from "./panorama.js";
 
 /** Pixels of the longest side of a thumbnail. */
 const THUMBNAIL = 240;
@@ -18,6 +19,7 @@ const LARGEST = 60e6;
  * @property {number} height
  * @property {import("./measure.js").Measures | null} measures
  * @property {Uint32Array | null} levels number of pixels of each level of a mask
+ * @property {import("./verdicts.js").Verdict | null} panorama what is to be known of it as a panorama
  * @property {Blob | null} thumbnail
  * @property {string} [error] why the file could not be read at all
  */
@@ -25,7 +27,7 @@ const LARGEST = 60e6;
 /** @param {MessageEvent<{id: number, file: File, kind: string, shown: boolean, library: string}>} message */
 async function onMessage({ data: { id, file, kind, shown, library } }) {
   /** @type {Looked} */
-  const looked = { id, digest: null, state: "unchecked", width: 0, height: 0, measures: null, levels: null, thumbnail: null };
+  const looked = { id, digest: null, state: "unchecked", width: 0, height: 0, measures: null, levels: null, panorama: null, thumbnail: null };
   try {
     looked.digest = await sha256(file, library);
     if (["photo", "mask"].includes(kind) && file.size <= LARGEST && "OffscreenCanvas" in globalThis) await decode(file, kind, shown, looked);
@@ -56,7 +58,14 @@ async function decode(file, kind, shown, looked) {
     const canvas = drawn(picture, MEASURED_SIDE);
     const pixels = context(canvas).getImageData(0, 0, canvas.width, canvas.height);
     if (kind === "mask") looked.levels = levels(pixels.data);
-    else looked.measures = measure(pixels.data, canvas.width, canvas.height);
+    else {
+      looked.measures = measure(pixels.data, canvas.width, canvas.height);
+      const ends = await new Blob([file.slice(0, XMP_BYTES), file.slice(-XMP_BYTES)]).text();
+      looked.panorama = panoramaOf(ends, picture.width, picture.height, () => {
+        const [width, height] = SIZE;
+        return context(drawn(picture, width)).getImageData(0, 0, width, height).data;
+      });
+    }
     looked.thumbnail = await drawn(canvas, THUMBNAIL).convertToBlob({ type: "image/webp", quality: 0.8 });
     looked.state = "read";
   } finally {

@@ -11,6 +11,7 @@ import { distance } from "./measure.js";
  * @property {number} width pixels, upright; 0 while not known
  * @property {number} height
  * @property {import("./measure.js").Measures | null} measures
+ * @property {Verdict | null} panorama
  */
 
 /**
@@ -74,7 +75,8 @@ export function verdicts(photos, limits) {
     if (photo.width * photo.height > limits.maxPixels) {
       return bad(`Too large: ${photo.width} × ${photo.height} pixels.`);
     }
-    const { measures } = photo;
+    const { measures, panorama } = photo;
+    if (panorama?.kind === "bad") return panorama;
     if (photo.state === "unchecked" || !measures) return { kind: "unchecked", text: "The server checks it: this browser does not show the format." };
     if (dark(photo)) return bad("Too dark: hardly anything can be seen.");
     if (bright(photo)) return bad("Too bright: most of it is white.");
@@ -85,7 +87,7 @@ export function verdicts(photos, limits) {
     const at = position.get(photo) ?? 0;
     const near = read.slice(Math.max(0, at - LOOKED_BACK), at).find((other) => alike(other.photo, photo, other.measures, measures));
     if (near) return { kind: "hint", text: `Almost the same view as ${near.photo.name}.` };
-    return { kind: "good", text: "Good" };
+    return panorama ?? { kind: "good", text: "Good" };
   });
 }
 
