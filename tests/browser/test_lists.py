@@ -110,6 +110,15 @@ def test_photos_are_deleted_and_restored(service: Up, model: SmallModel, page: P
     expect(row).to_contain_text("Photos")
     expect(page.get_by_role("button", name="Delete the photos not needed")).to_have_count(0)
     assert binned(service) == [capture]
+    # On a phone, what can be done lies within the window.
+    page.set_viewport_size({"width": 390, "height": 780})
+    for button in (
+        *row.get_by_role("button").all(),
+        page.get_by_role("button", name="Delete the photos").last,
+    ):
+        box = button.bounding_box()
+        assert box is not None
+        assert 0 <= box["x"] <= box["x"] + box["width"] <= 390
     page.get_by_role("button", name="Undo").click()
     expect(page.get_by_role("button", name="Delete the photos not needed")).to_be_visible()
     assert binned(service) == []
@@ -129,8 +138,10 @@ def test_a_model_and_its_job_are_renamed(service: Up, model: SmallModel, page: P
             expect(page.get_by_role("heading", level=1)).to_have_text(address)
             expect(page.get_by_role("button", name="Name and tags")).to_be_focused()
             assert service.http.get(f"/v1/models/{model.id}").json()["name"] == address
+            stored = service.http.get("/v1/storage").json()["largest"]
+            assert {record["name"] for record in stored if record["id"] == model.id} == {address}
         page.get_by_role("button", name="Name and tags").click()
-        page.get_by_role("dialog").get_by_role("button", name="Keep").click()
+        page.get_by_role("dialog").get_by_role("button", name="Cancel").click()
         expect(page.get_by_role("heading", level=1)).to_have_text("again")
     finally:
         service.http.patch(f"/v1/models/{model.id}", json={"name": "still life"})

@@ -51,6 +51,7 @@ def test_figures_and_settings_are_in_plain_words_with_a_link_to_what_they_mean(s
     )
     expect(shown.locator("#downloads")).to_contain_text("view-dependent colour", timeout=WAIT)
     assert not FOR_PROGRAMS.findall(shown.inner_text("main"))
+    assert " bits" not in shown.inner_text("#downloads"), "what a format loses is behind a fold"
     shown.locator("#lead .term").last.click()
     expect(shown.locator("dt:target")).to_have_text("dB, PSNR")
     explained = (ROOT / "docs" / "report.md").read_text()
@@ -266,8 +267,11 @@ def test_a_model_that_is_not_there_is_said(visit: Visit) -> None:
 def test_deleting_asks_first(model: SmallModel, shown: Page) -> None:
     shown.get_by_role("button", name="Delete").click()
     dialog = shown.get_by_role("dialog")
-    expect(dialog).to_contain_text("restored for a day")
-    dialog.get_by_role("button", name="Keep").click()
+    said = dialog.locator("p").inner_text()
+    assert "The model stays in the bin for a day, and can be restored there." in said
+    bin_text = "async () => (await import('/page/any/bin.js')).binText('model', 1)"
+    assert said == shown.evaluate(bin_text), "as the lists say it afterwards"
+    dialog.get_by_role("button", name="Cancel").click()
     expect(dialog).to_have_count(0)
     assert shown.url.endswith(model.id)
 

@@ -45,6 +45,7 @@ def test_links_are_made_and_revoked_on_the_page(service: Up, model: SmallModel, 
     dialog.get_by_label("For whom").fill("for mum")
     page.keyboard.press("Enter")
     link = dialog.get_by_label("The link").input_value()
+    assert f'<iframe src="{link}/embed" ' in dialog.get_by_label("HTML of a frame").input_value()
     bare = httpx.get(f"{link}/model").json()
     assert bare["id"] == model.id
     dialog.get_by_label("Show photos too").check()

@@ -7,7 +7,7 @@ from __future__ import annotations
 import re
 
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Page, Route, expect
 
 from splatmill_server.web.pages import PAGE
 from tests.browser.conftest import Open, SmallModel, Visit
@@ -47,6 +47,34 @@ def test_the_navigation_works_by_keyboard(page: Page) -> None:
     page.keyboard.press("Enter")
     expect(page.get_by_role("heading", level=1)).to_have_text("Models")
     assert page.url.endswith("/models")
+
+
+def test_a_page_of_another_version_than_its_server_says_so(visit: Visit) -> None:
+    visit.watched.allow("status of 404|a part that is gone")
+    page = visit.page
+    page.goto("/jobs")
+    known = page.evaluate(
+        "async () => (await import('/page/any/api.js')).get('/v1/nothing').catch((no) => no.code)"
+    )
+    assert known == "not_found", "its own fault"
+
+    # The page as an older server gave it out; what it loads is the present server's.
+    def older(route: Route) -> None:
+        body = route.fetch().text().replace(PAGE.digest, "0" * len(PAGE.digest))
+        route.fulfill(body=body, content_type="text/html")
+
+    page.route("**/jobs", older, times=1)
+    page.goto("/jobs")
+    problem = """async () => {
+      const { get } = await import("/page/any/api.js");
+      return get("/v1/nothing").catch((no) => no.advice);
+    }"""
+    assert page.evaluate(problem) == "Reload the page."
+    page.evaluate("setTimeout(() => { throw new TypeError('a part that is gone'); })")
+    notice = page.get_by_role("status").filter(has_text="another version")
+    notice.get_by_role("button", name="Reload").click()
+    expect(notice).to_have_count(0)
+    assert page.evaluate(problem) != "Reload the page.", "it is the present one"
 
 
 def test_the_theme_follows_the_system_until_it_is_chosen(service: Up, open_window: Open) -> None:

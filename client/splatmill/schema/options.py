@@ -109,8 +109,8 @@ class TrainOptions(Request):
     preset: Preset = Field(
         default=Preset.balanced,
         description=(
-            "Draft for a quick look, quality for the best result: how far to train where no time and no number of steps "
-            "is given, and the largest photo size where image_size is not given."
+            "Draft for a quick look, quality for the best result: how far to train where no time and no number of "
+            "steps is given, and the largest photo size where image_size is not given."
         ),
         json_schema_extra=_BUDGET,
     )
@@ -129,8 +129,8 @@ class TrainOptions(Request):
         ge=1,
         le=7 * 86400,
         description=(
-            "Time for the training alone: 90s, 5m, 1h30m, or a number of seconds. The whole schedule is fitted into it. "
-            "Finding the cameras before it and measuring quality after it take additional time."
+            "Time for the training alone: 90s, 5m, 1h30m, or a number of seconds. The whole schedule is fitted into "
+            "it. Finding the cameras before it and measuring quality after it take additional time."
         ),
         json_schema_extra=_BUDGET | {"kind": "duration"},
     )
@@ -139,9 +139,10 @@ class TrainOptions(Request):
         ge=5,
         le=7 * 86400,
         description=(
-            "Time for the whole job, from its first photo to the finished model: 90s, 5m, 1h30m, or a number of seconds. "
-            "Training gets what finding the cameras leaves of it, less what measuring and storing will take. A time that "
-            "is too short by the jobs that have finished on this server is refused, with the least that is enough."
+            "Time for the whole job, from its first photo to the finished model: 90s, 5m, 1h30m, or a number of "
+            "seconds. Training gets what finding the cameras leaves of it, less what measuring and storing will take. "
+            "A time that is too short by the jobs that have finished on this server is refused, with the least that "
+            "is enough."
         ),
         json_schema_extra=_BUDGET | {"kind": "duration"},
     )

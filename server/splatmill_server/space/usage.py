@@ -130,7 +130,7 @@ def largest(
             kind=held.kind,
             id=held.id,
             owner=held.owner,
-            name=held.name,
+            name=_name(snapshot, held),
             bytes=held.size,
             files=held.files,
             last_used=moment(snapshot.last_used[held.key]),
@@ -139,6 +139,12 @@ def largest(
         )
         for held in holdings[:count]
     ]
+
+
+def _name(snapshot: Snapshot, held: Holding) -> str | None:
+    """The name of a record now: jobs, and models with them, are renamed after their folders were read."""
+    job = None if held.kind is StoredKind.capture else snapshot.jobs.get(held.id)
+    return job.name if job is not None and job.readable else held.name
 
 
 def moment(seconds: float) -> datetime:

@@ -69,7 +69,21 @@ export async function request(method, path, { query = {}, json, body, headers = 
     signIn();
     await new Promise(() => {}); // the page is being left
   }
-  throw problem;
+  throw UNKNOWN.includes(problem.code) && (await isOutdated()) ? new Problem({ ...problem.document, ...OUTDATED }) : problem;
+}
+
+/** What a server answers to requests that it does not know. */
+const UNKNOWN = ["not_found", "method_not_allowed", "invalid_request", "http_error"];
+
+/** In place of what fails then. */
+export const OUTDATED = { code: "page_outdated", detail: "This page is of another version than its server.", advice: "Reload the page." };
+
+/** Whether the server has another version of this page by now. */
+export async function isOutdated() {
+  const version = (/** @type {string} */ text) => /\/page\/(\w+)\//.exec(text)?.[1];
+  const own = version(/** @type {HTMLScriptElement} */ (document.querySelector("script[type=module]")).src);
+  const now = await fetch(location.href, { credentials: "same-origin" }).then((answer) => answer.text()).then(version, () => own);
+  return now !== undefined && now !== own;
 }
 
 /** @param {string} detail */

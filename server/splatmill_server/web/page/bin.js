@@ -11,10 +11,26 @@ export function binned(kind, id) {
   return `/v1/bin/${kind}s/${encodeURIComponent(id)}`;
 }
 
+/** What is deleted, as people call it: one, several, and what goes along and what stays. */
+const NOUNS = /** @type {const} */ ({
+  model: ["model", "models", "Jobs and reports go with their models, and links to them open nothing meanwhile. The photos are kept."],
+  job: ["job", "jobs", "Models and reports go with their jobs, and links to them open nothing meanwhile. The photos are kept."],
+  photos: ["set of photos", "sets of photos", "Models made of them are kept."],
+});
+
+/**
+ * What deleting does: the same sentences before and after it, wherever something is deleted.
+ * @param {keyof typeof NOUNS} noun @param {number} many
+ */
+export function binText(noun, many) {
+  const [one, several, more] = NOUNS[noun];
+  return `${many === 1 ? `The ${one} stays` : `${many} ${several} stay`} in the bin for a day, and can be restored there. ${more}`;
+}
+
 /**
  * Put records into the bin, and offer to restore them.
  * @param {{kind: "job" | "capture", id: string}[]} records
- * @param {[string, string]} noun what one of them is called, and several: ["model", "models"]
+ * @param {keyof typeof NOUNS} noun
  * @param {(ids: string[]) => unknown} gone called with those that are in the bin
  * @param {() => unknown} back called when they are restored
  */
@@ -31,8 +47,7 @@ export async function putInBin(records, noun, gone, back) {
   }
   if (!done.length) return;
   await gone(done.map(({ id }) => id));
-  const what = done.length === 1 ? `The ${noun[0]} is` : `${done.length} ${noun[1]} are`;
-  notify(`${what} in the bin, and deleted for good in a day.`, "good", { text: "Undo", act: async () => {
+  notify(binText(noun, done.length), "good", { text: "Undo", act: async () => {
     for (const { kind, id } of done) await send("DELETE", binned(kind, id));
     await back();
   } });

@@ -14,6 +14,9 @@ export const RUNNING = Object.keys(STATES).slice(1);
 
 const ENDS = /** @type {const} */ ({ succeeded: "Finished", failed: "Failed", cancelled: "Cancelled" });
 
+/** What cancelling does. */
+export const CANCELLING = "It ends without a model. What it has done is kept, so a restart continues from there.";
+
 /** Those that nothing follows. */
 export const FINAL = Object.keys(ENDS);
 

@@ -94,7 +94,7 @@ function askLabels(address, record, changed) {
         h("p", { class: "hint", id: "new-tags-hint" }, "Words to find it by, separated by commas.")),
       problem,
       h("div", { class: "row" },
-        h("button", { class: "push", type: "button", onclick: () => dialog.close() }, "Keep"),
+        h("button", { class: "push", type: "button", onclick: () => dialog.close() }, "Cancel"),
         h("button", { class: "primary", type: "submit" }, "Save"))));
   document.body.append(dialog);
   dialog.showModal();

@@ -65,7 +65,8 @@ export async function openSharing(address, name) {
     void tried(async () => {
       const share = await send("POST", `${address}/shares`, { expires_in: term.value, name: label.value.trim() || null, photos: photos.checked });
       request("HEAD", `${address}/download/sog`).catch(() => {}); // what visitors load is made before they come
-      made.replaceChildren(link(`${location.origin}${at(share.path)}`));
+      made.replaceChildren(link(`${location.origin}${at(share.path)}`, name));
+      made.scrollIntoView({ block: "nearest" });
       label.value = "";
       await show();
     });
@@ -76,16 +77,29 @@ export async function openSharing(address, name) {
   await tried(show);
 }
 
-/** The address of a new link, which the server cannot show again. @param {string} address */
-function link(address) {
+/**
+ * The HTML of a frame that shows a shared model alone.
+ * @param {string} address of its link @param {string} name of the model
+ */
+export function frameOf(address, name) {
+  const title = name.replace(/[&"<>]/g, (sign) => `&#${sign.charCodeAt(0)};`);
+  return `<iframe src="${address}/embed" width="800" height="500" title="${title}" allow="fullscreen" loading="lazy"></iframe>`;
+}
+
+/** The address of a new link, which the server cannot show again. @param {string} address @param {string} name of the model */
+function link(address, name) {
   const shown = h("input", { id: "share-link", readonly: true, value: address, onfocus: () => shown.select() });
-  const said = h("span", { class: "hint", role: "status" });
+  const frame = h("textarea", { id: "share-frame", rows: 3, readonly: true, spellcheck: "false", onfocus: () => frame.select() }, frameOf(address, name));
+  const [said, saidOfFrame] = [0, 1].map(() => h("span", { class: "hint", role: "status" }));
   return h("div", { class: "field" },
     h("label", { for: "share-link" }, "The link, which is shown only now"),
     shown,
     h("div", { class: "row" },
       h("button", { class: "small", type: "button", onclick: () => copy(shown, said) }, "Copy"),
       h("a", { class: "button small", href: address, target: "_blank", rel: "noopener" }, "Open"), said),
+    h("label", { for: "share-frame" }, "To show it on a page of yours, HTML of a frame"),
+    frame,
+    h("div", { class: "row" }, h("button", { class: "small", type: "button", onclick: () => copy(frame, saidOfFrame) }, "Copy the HTML"), saidOfFrame),
     isLoopback(location.hostname)
       && h("p", { class: "hint" }, `Only this machine reaches ${location.host}. For others, make the link where this page is open under the name or the network address of the server.`));
 }

@@ -2,7 +2,7 @@
 
 import { at, pathOfPage } from "./address.js";
 import { adviceOf } from "./advice.js";
-import { Problem, request, signIn, whole } from "./api.js";
+import { OUTDATED, Problem, isOutdated, request, signIn, whole } from "./api.js";
 import { h } from "./dom.js";
 
 const THEME = "splatmill.theme";
@@ -39,8 +39,9 @@ export async function startShell({ open = false, visitor = false, viewer = false
     if (event.reason instanceof Problem) {
       event.preventDefault();
       notify(event.reason);
-    }
+    } else void sayOutdated();
   });
+  window.addEventListener("error", () => void sayOutdated());
   if (viewer && !viewerInstalled) {
     main.prepend(h("div", { class: "notice", "data-kind": "warning" },
       h("p", {}, "The 3D viewer is not installed on this server, so pictures come from the server's renderer."),
@@ -52,6 +53,15 @@ export async function startShell({ open = false, visitor = false, viewer = false
       h("button", { class: "quiet small", type: "button", onclick: signOut }, "Sign out"));
   }
   return caller;
+}
+
+let saysOutdated = false;
+
+/** Say why a page fails whose server was replaced while it was open. */
+async function sayOutdated() {
+  if (saysOutdated || !(await isOutdated())) return;
+  saysOutdated = true;
+  notify(OUTDATED.detail, "warning", { text: "Reload", act: () => location.reload() });
 }
 
 /** @param {boolean} open */
@@ -147,15 +157,16 @@ export function noticeOf(message, kind = message instanceof Error ? "error" : "i
  * @param {string} question.title
  * @param {string} question.text what will happen
  * @param {string} question.action the button that does it
+ * @param {string} [question.keep] the button that does nothing
  * @returns {Promise<boolean>}
  */
-export function confirmAction({ title, text, action }) {
+export function confirmAction({ title, text, action, keep = "Cancel" }) {
   return new Promise((resolve) => {
     const dialog = h("dialog", { "aria-labelledby": "confirm-title" },
       h("form", { method: "dialog", class: "stack" },
         h("h2", { id: "confirm-title" }, title), h("p", {}, text),
         h("div", { class: "row" },
-          h("button", { class: "push", value: "no", autofocus: true }, "Keep"),
+          h("button", { class: "push", value: "no", autofocus: true }, keep),
           h("button", { class: "danger", value: "yes" }, action))));
     dialog.addEventListener("close", () => {
       resolve(dialog.returnValue === "yes");

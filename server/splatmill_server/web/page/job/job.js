@@ -5,7 +5,7 @@ import { ErrorChart } from "../chart.js";
 import { byId, h } from "../dom.js";
 import { figures } from "../figures.js";
 import { bytes, count, moment, number, seconds } from "../format.js";
-import { FINAL, badgeKind, badgeText } from "../job_states.js";
+import { CANCELLING, FINAL, badgeKind, badgeText } from "../job_states.js";
 import { labelButton, starButton, tagLinks } from "../labels.js";
 import { titleOf } from "../new/titles.js";
 import { confirmAction, noticeOf, notify, startShell } from "../shell.js";
@@ -300,7 +300,7 @@ function actions() {
 }
 
 async function cancel() {
-  if (!await confirmAction({ title: "Cancel this job?", text: "Training ends. Its last checkpoint is kept, so the job can be restarted.", action: "Cancel the job" })) return;
+  if (!await confirmAction({ title: "Cancel this job?", text: CANCELLING, action: "Cancel the job", keep: "Let it run" })) return;
   try {
     job = await send("POST", `${address}/cancel`);
   } catch (error) {

@@ -22,7 +22,7 @@ export async function showBin(section, changed) {
   };
   section.replaceChildren(h("h2", { id: "bin-title" }, "Bin"),
     h("p", { class: "hint" }, "What is here counts as used storage until it is deleted for good."),
-    h("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "Entries of the bin" }, h("table", { class: "table" },
+    h("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "Entries of the bin" }, h("table", { class: "table stacks" },
       h("thead", {}, h("tr", {}, ["What", "Name", "Deleted for good", ""].map((text) => h("th", { scope: "col" }, text)))),
       h("tbody", {}, entries.map((/** @type {any} */ entry) => row(entry, again))))));
   return new Set(entries.map((/** @type {any} */ entry) => entry.id));
@@ -35,7 +35,7 @@ function row(entry, changed) {
   return h("tr", {},
     h("td", {}, kind === "capture" ? "Photos" : entry.model ? "Model" : "Job"),
     h("td", {}, name),
-    h("td", {}, ago(entry.deleted_at)),
+    h("td", { "data-label": "Deleted for good" }, ago(entry.deleted_at)),
     h("td", {}, h("div", { class: "row" },
       h("button", { class: "small", type: "button", "aria-label": `Restore ${name}`, onclick: async () => {
         await send("DELETE", binned(kind, id));

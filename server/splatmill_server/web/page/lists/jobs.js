@@ -4,7 +4,7 @@ import { Problem, get, send } from "../api.js";
 import { putInBin } from "../bin.js";
 import { h } from "../dom.js";
 import { ago, moment, seconds } from "../format.js";
-import { FINAL, RUNNING, badgeKind, badgeText } from "../job_states.js";
+import { CANCELLING, FINAL, RUNNING, badgeKind, badgeText } from "../job_states.js";
 import { exampleOffer } from "../example.js";
 import { stageName } from "../job/course.js";
 import { starButton, tagLinks } from "../labels.js";
@@ -66,7 +66,7 @@ function facts(job) {
 /** @param {any} job */
 async function cancel(job) {
   const yes = await confirmAction({
-    title: "Cancel this job?", text: "It ends without a model. What it has done is kept, so a restart continues from there.", action: "Cancel the job",
+    title: "Cancel this job?", text: CANCELLING, action: "Cancel the job", keep: "Let it run",
   });
   if (!yes) return;
   list.update(await send("POST", `/v1/jobs/${job.id}/cancel`));
@@ -79,7 +79,7 @@ function remove(job) {
 
 /** Put jobs into the bin, with their models. @param {any[]} jobs */
 function removeAll(jobs) {
-  return putInBin(jobs.map(({ id }) => ({ kind: "job", id })), ["job", "jobs"], (ids) => ids.forEach(list.remove), list.reload);
+  return putInBin(jobs.map(({ id }) => ({ kind: "job", id })), "job", (ids) => ids.forEach(list.remove), list.reload);
 }
 
 async function refresh() {

@@ -36,7 +36,7 @@ function entry(model) {
 
 /** Put models into the bin, with their jobs. @param {any[]} models */
 function removeAll(models) {
-  return putInBin(models.map(({ job }) => ({ kind: "job", id: job })), ["model", "models"], (ids) => {
+  return putInBin(models.map(({ job }) => ({ kind: "job", id: job })), "model", (ids) => {
     ids.forEach(list.remove);
     return stored();
   }, back);
@@ -75,14 +75,14 @@ async function storage(inBin) {
   }
   if (largest.length) {
     const expire = largest.some((/** @type {any} */ record) => record.expires_at);
-    append(body, [h("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "Largest records" }, h("table", { class: "table" },
+    append(body, [h("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "Largest records" }, h("table", { class: "table stacks" },
       h("caption", {}, "The largest records"),
       h("thead", {}, h("tr", {}, ["What", "Name", "Last used", ...(expire ? ["Deleted"] : [])].map((text) => h("th", { scope: "col" }, text)), h("th", { scope: "col", class: "number" }, "Size"), h("td", {}))),
       h("tbody", {}, largest.map((/** @type {any} */ record) => h("tr", {},
         h("td", {}, { capture: "Photos", job: "Checkpoints", model: "Model" }[/** @type {string} */ (record.kind)] ?? record.kind),
         h("td", {}, place(record)),
-        h("td", {}, ago(record.last_used)),
-        expire ? h("td", {}, record.expires_at ? ago(record.expires_at) : "not by itself") : null,
+        h("td", { "data-label": "Last used" }, ago(record.last_used)),
+        expire ? h("td", { "data-label": "Deleted" }, record.expires_at ? ago(record.expires_at) : "not by itself") : null,
         h("td", { class: "number" }, bytes(record.bytes)),
         h("td", {}, record.kind === "capture" ? deletePhotos(record) : null))))))]);
   }
@@ -94,7 +94,7 @@ function deletePhotos({ id, name, needed_by: user }) {
   const text = name || id.slice(0, 8);
   return h("button", {
     class: "quiet small", type: "button", disabled: Boolean(user), title: user ? `The job ${user.slice(0, 8)} needs them.` : null, "aria-label": `Delete the photos ${text}`,
-    onclick: () => putInBin([{ kind: "capture", id }], ["set of photos", "sets of photos"], stored, stored),
+    onclick: () => putInBin([{ kind: "capture", id }], "photos", stored, stored),
   }, "Delete");
 }
 

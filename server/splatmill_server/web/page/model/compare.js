@@ -20,6 +20,7 @@ export function showCompare(section, { address, cameras, background, report }) {
     h("span", { class: "tag left" }, "Photo"), h("span", { class: "tag right" }, "Model"));
   const caption = h("figcaption", { class: "number", role: "status" });
   const slider = h("input", { type: "range", min: 0, max: 100, value: 50, step: 1, "aria-label": "How much of the picture is the photo, in percent" });
+  const fitted = h("div", { class: "fitted" }, pair, slider);
   const list = h("ul", { class: "photos", "aria-label": "Held-out photos" });
   const order = h("select", { "aria-label": "Order of the photos" },
     h("option", { value: "name" }, "In order"), h("option", { value: "worst" }, "Worst first"));
@@ -47,7 +48,7 @@ export function showCompare(section, { address, cameras, background, report }) {
     current = camera;
     const { width, height } = camera.camera;
     pair.style.aspectRatio = `${width} / ${height}`;
-    pair.style.maxWidth = `calc(75vh * ${width / height})`;
+    fitted.style.maxWidth = `calc(75vh * ${width / height})`;
     photo.src = `${address}/files/${camera.photo}`;
     photo.alt = `The photo ${camera.name}`;
     render.src = `${address}/render?${renderQuery(camera.camera, background)}`;
@@ -76,7 +77,7 @@ export function showCompare(section, { address, cameras, background, report }) {
     h("p", { class: "muted" }, `${count(photos.length, "photo")} ${photos.length === 1 ? "was" : "were"} `, term("held out", "held-out"), ` from the training. Figures are those of the training's report${report.result?.ssim ? `: on average ${decibels(report.result.psnr)}, SSIM ${report.result.ssim.toFixed(3)}` : ""}.`,
       missing > 0 && ` ${number(missing)} more ${missing === 1 ? "has" : "have"} no picture here; the report says why.`),
     h("div", { class: "compare" },
-      h("figure", {}, pair, slider, caption),
+      h("figure", {}, fitted, caption),
       h("div", { class: "stack" }, order, list)));
   fill();
   cut();

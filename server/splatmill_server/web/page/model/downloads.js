@@ -14,6 +14,7 @@ import { noticeOf } from "../shell.js";
  * @property {string} name
  * @property {string} href
  * @property {string} what
+ * @property {string} [loses] what a model loses in it, in the words of the field
  * @property {number | null} size bytes; null until it was made
  * @property {string} [psnr] of the model in this file, as text
  * @property {string} [loss] what it is less than that of model.ply, as text
@@ -51,7 +52,7 @@ export async function showDownloads(section, { model, address }) {
   const body = h("tbody", { role: "rowgroup" });
   const state = h("div", { role: "status" });
   section.append(h("h2", { id: "downloads-title" }, "Downloads"),
-    h("div", { class: "scroll" }, h("table", { class: "table", role: "table" },
+    h("div", { class: "scroll" }, h("table", { class: "table stacks", role: "table" },
       h("thead", { role: "rowgroup" }, h("tr", { role: "row" }, ["File", "Size", "PSNR"].map((text, i) =>
         h("th", { scope: "col", role: "columnheader", class: i > 0 && "number" }, text)))),
       body)),
@@ -102,7 +103,8 @@ function formatRows(answer, address) {
     return {
       name: plain ? "model.ply" : name,
       href: plain ? `${address}/files/model.ply` : href,
-      what: `Losses: ${loses} Read by ${readers.join(", ")}.`,
+      what: `Read by ${readers.join(", ")}.`,
+      loses,
       size,
       madeAt: size === null ? href : undefined,
       ...(plain ? { psnr: answer.psnr === null ? "" : `${answer.psnr.toFixed(2)} dB` } : qualityOf(conversion)),
@@ -111,7 +113,7 @@ function formatRows(answer, address) {
   const held = rows[answer.formats.findIndex((/** @type {any} */ { format }) => format === IN_ONE_FILE)];
   if (held) {
     rows.push({
-      ...held, name: "Page in one file (.html)", href: `${address}/download/html`, size: null,
+      ...held, name: "Page in one file (.html)", href: `${address}/download/html`, size: null, loses: undefined,
       what: "The model with its viewer, to open without a server or to mail. It holds the .sog.",
     });
   }
@@ -134,10 +136,11 @@ function qualityOf(conversion) {
  * @param {Set<string>} making
  * @param {() => void} onAsked
  */
-function rowOf({ name, href, what, size, psnr = "", loss = "", madeAt }, making, onAsked) {
+function rowOf({ name, href, what, loses, size, psnr = "", loss = "", madeAt }, making, onAsked) {
   const unmade = madeAt && making.has(madeAt) ? "being made" : "made on demand";
   return h("tr", { role: "row" },
-    h("td", { role: "cell" }, h("a", { href, download: "", onclick: onAsked }, name), h("div", { class: "muted small" }, what)),
+    h("td", { role: "cell" }, h("a", { href, download: "", onclick: onAsked }, name), h("div", { class: "muted small" }, what),
+      loses && h("details", { class: "muted small" }, h("summary", {}, "What it loses"), loses)),
     h("td", { role: "cell", class: "number" }, size === null ? unmade : bytes(size)),
     h("td", { role: "cell", class: "number" }, psnr, loss && h("div", { class: "muted small" }, loss)));
 }

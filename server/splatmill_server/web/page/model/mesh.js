@@ -93,7 +93,7 @@ export async function showMesh(section, { model, address }, stage) {
     h("div", { class: "row" },
       h("div", { class: "field" }, h("label", { for: "mesh-format" }, "File"), format),
       h("div", { class: "field" }, h("label", { for: "mesh-faces" }, "Most triangles"), faces)),
-    h("div", { class: "row" }, box, h("label", { for: "mesh-box" }, "Only what lies in the box of Crop and clean")),
+    h("label", { class: "row", for: "mesh-box" }, box, "Only what lies in the box of Crop and clean"),
     h("div", { class: "row" }, make, stop), state, place, kept);
   try {
     const [unfinished] = await list();

@@ -10,7 +10,7 @@ import { showDownloads } from "./downloads.js";
 import { showMesh } from "./mesh.js";
 import { showOrbit } from "./orbit.js";
 import { Stage } from "./stage.js";
-import { binned } from "../bin.js";
+import { binText, binned } from "../bin.js";
 import { figures } from "../figures.js";
 import { labelButton, starButton, tagLinks } from "../labels.js";
 import { originOf } from "./origin.js";
@@ -120,7 +120,7 @@ function actions({ model, address }) {
 async function remove(model) {
   const yes = await confirmAction({
     title: "Delete this model?",
-    text: "The model, its report, its files and its job go to the bin, from where they can be restored for a day. Links to the model open nothing meanwhile. The photos are kept.",
+    text: binText("model", 1),
     action: "Delete the model",
   });
   if (!yes) return;

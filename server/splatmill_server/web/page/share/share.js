@@ -4,7 +4,7 @@ import { get } from "../api.js";
 import { byId, h } from "../dom.js";
 import { figures } from "../figures.js";
 import { bytes, moment } from "../format.js";
-import { copy } from "../sharing.js";
+import { copy, frameOf } from "../sharing.js";
 import { address, showShared } from "./shared_model.js";
 import { startShell } from "../shell.js";
 
@@ -25,8 +25,7 @@ if (model) {
     h("a", { href: `${address}/files/${file.name}`, download: file.name }, KINDS[file.name]),
     h("span", { class: "number" }, `${file.name.split(".").pop()}, ${bytes(file.size)}`))));
   const frame = /** @type {HTMLTextAreaElement} */ (byId("embed"));
-  const name = (model.name || "A scene in 3D").replace(/[&"<>]/g, (/** @type {string} */ sign) => `&#${sign.charCodeAt(0)};`);
-  frame.value = `<iframe src="${location.origin}${location.pathname.replace(/\/$/, "")}/embed" width="800" height="500" title="${name}" allow="fullscreen" loading="lazy"></iframe>`;
+  frame.value = frameOf(`${location.origin}${location.pathname.replace(/\/$/, "")}`, model.name || "A scene in 3D");
   frame.addEventListener("focus", () => frame.select());
   byId("copy").addEventListener("click", () => copy(frame, byId("copied")));
   byId("until").textContent = `This link is valid until ${moment(model.expires_at)}.`;
