@@ -31,11 +31,25 @@ _LIGHT = np.array([0.45, -0.35, 0.82])
 _AMBIENT = 0.42
 """Share of a surface's colour that is seen in shadow."""
 
+_MARGIN = 1e-3
+"""What is added to the reach of a solid, in world units, and to the angles of a tile, for what rounding leaves."""
+
 _DOME_RADIUS = 40.0
 """World units, around the origin."""
 
-_RAYS_PER_BAND = 16384
-"""Rays cast at a time, in whole rows of pixels; their intermediate results stay in the cache."""
+_TILE = 128
+"""Pixels along each side of a tile, whose rays are cast at a time: their intermediate results stay in the cache, and
+most solids are met by none of them."""
+
+
+def _dot(a: Tensor, b: Tensor) -> Tensor:
+    """Dot products along the last axis, of three. A sum along so short an axis takes several times as long."""
+    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
+
+
+def _from(origin: Tensor, center: tuple[float, float, float]) -> list[Tensor]:
+    """The coordinates of `origin` [..., 3], counted from `center`."""
+    return [origin[..., axis] - center[axis] for axis in range(3)]
 
 
 @dataclass(frozen=True)
@@ -73,21 +87,26 @@ class Box:
     scale: float
     shine: float = 0.0
 
-    def _local(self, v: Tensor) -> Tensor:
+    @property
+    def reach(self) -> float:
+        return math.hypot(*self.half)
+
+    def _turned(self, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         c, s = math.cos(self.turn), math.sin(self.turn)
-        return torch.stack([c * v[..., 0] + s * v[..., 1], c * v[..., 1] - s * v[..., 0], v[..., 2]], -1)
+        return c * x + s * y, c * y - s * x, z
 
     def hit(self, origin: Tensor, rays: Tensor) -> Tensor:
-        o = self._local(origin - torch.tensor(self.center))
-        inverse = 1.0 / self._local(rays)
-        half = torch.tensor(self.half)
-        a, b = (-half - o) * inverse, (half - o) * inverse
-        near = torch.minimum(a, b).amax(-1)
-        far = torch.maximum(a, b).amin(-1)
+        places = self._turned(*_from(origin, self.center))
+        near, far = torch.tensor(-math.inf), torch.tensor(math.inf)
+        for half, place, ray in zip(self.half, places, self._turned(*rays.unbind(-1)), strict=True):
+            inverse = 1.0 / ray
+            a, b = (-half - place) * inverse, (half - place) * inverse
+            near = torch.maximum(near, torch.minimum(a, b))
+            far = torch.minimum(far, torch.maximum(a, b))
         return torch.where((near < far) & (near > _NEAR), near, _FAR)
 
     def surface(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        local = self._local(points - torch.tensor(self.center))
+        local = torch.stack(self._turned(*_from(points, self.center)), -1)
         unit = local / torch.tensor(self.half)
         axis = unit.abs().argmax(-1)
         sign = torch.sign(unit.gather(-1, axis[:, None]))
@@ -112,10 +131,14 @@ class Sphere:
     scale: float
     shine: float = 0.0
 
+    @property
+    def reach(self) -> float:
+        return self.radius
+
     def hit(self, origin: Tensor, rays: Tensor) -> Tensor:
         o = origin - torch.tensor(self.center)
-        b = (o * rays).sum(-1)
-        disc = b * b - ((o * o).sum(-1) - self.radius**2)
+        b = _dot(o, rays)
+        disc = b * b - (_dot(o, o) - self.radius**2)
         t = -b - disc.clamp(min=0).sqrt()
         return torch.where((disc > 0) & (t > _NEAR), t, _FAR)
 
@@ -137,16 +160,19 @@ class Cylinder:
     scale: float
     shine: float = 0.0
 
+    @property
+    def reach(self) -> float:
+        return math.hypot(self.radius, self.half_height)
+
     def hit(self, origin: Tensor, rays: Tensor) -> Tensor:
-        o = origin - torch.tensor(self.center)
-        a = (rays[..., :2] ** 2).sum(-1)
-        b = (o[..., :2] * rays[..., :2]).sum(-1)
-        disc = b * b - a * ((o[..., :2] ** 2).sum(-1) - self.radius**2)
+        (x, y, z), (along_x, along_y, along_z) = _from(origin, self.center), rays.unbind(-1)
+        a = along_x * along_x + along_y * along_y
+        b = x * along_x + y * along_y
+        disc = b * b - a * (x * x + y * y - self.radius**2)
         side = (-b - disc.clamp(min=0).sqrt()) / a
-        on_side = (disc > 0) & (side > _NEAR) & ((o[..., 2] + side * rays[..., 2]).abs() < self.half_height)
-        lid = (self.half_height - o[..., 2]) / rays[..., 2]
-        at = o[..., :2] + lid[..., None] * rays[..., :2]
-        on_lid = (lid > _NEAR) & ((at * at).sum(-1) < self.radius**2)
+        on_side = (disc > 0) & (side > _NEAR) & ((z + side * along_z).abs() < self.half_height)
+        lid = (self.half_height - z) / along_z
+        on_lid = (lid > _NEAR) & ((x + lid * along_x) ** 2 + (y + lid * along_y) ** 2 < self.radius**2)
         return torch.minimum(torch.where(on_side, side, _FAR), torch.where(on_lid, lid, _FAR))
 
     def surface(self, points: Tensor) -> tuple[Tensor, Tensor]:
@@ -251,30 +277,40 @@ def photograph(scene: StillLife, camera: Camera, samples: int = 2) -> tuple[np.n
     """
     rgb = np.empty((camera.height, camera.width, 3), np.uint8)
     depth = np.empty((camera.height, camera.width), np.float32)
-    for rows in _bands(camera):
-        color, centers = _sampled(scene, camera, rows, samples)
-        rgb[rows] = color
+    for tile in _tiles(camera):
+        color, centers = _sampled(scene, camera, tile, samples)
+        rgb[tile] = color
         if centers is None:
-            centers = _cast(scene, camera, rows, 0.5, 0.5, shade=False)[1]
-        depth[rows] = centers.numpy()
+            centers = _cast(scene, camera, tile, 0.5, 0.5, shade=False)[1]
+        depth[tile] = centers.numpy()
     return rgb, depth
 
 
 def picture(scene: StillLife, camera: Camera, samples: int = 2) -> np.ndarray:
     """The colours that `photograph` returns, uint8 [H, W, 3], without the rays that only measure depth."""
-    return np.concatenate([_sampled(scene, camera, rows, samples)[0] for rows in _bands(camera)])
+    rgb = np.empty((camera.height, camera.width, 3), np.uint8)
+    for tile in _tiles(camera):
+        rgb[tile] = _sampled(scene, camera, tile, samples)[0]
+    return rgb
 
 
-def _bands(camera: Camera) -> list[slice]:
-    """The rows of a photo, in bands of `_RAYS_PER_BAND` pixels."""
-    band = max(1, _RAYS_PER_BAND // camera.width)
-    return [slice(top, min(top + band, camera.height)) for top in range(0, camera.height, band)]
+Tile = tuple[slice, slice]
+"""Rows and columns of a photo."""
 
 
-def _sampled(scene: StillLife, camera: Camera, rows: slice, samples: int) -> tuple[np.ndarray, Tensor | None]:
-    """Colour uint8 [rows, W, 3], and depth [rows, W] where one of the rays goes through the pixel centres, or None."""
+def _tiles(camera: Camera) -> list[Tile]:
+    """The tiles of a photo."""
+    rows, columns = (
+        [slice(start, min(start + _TILE, size)) for start in range(0, size, _TILE)]
+        for size in (camera.height, camera.width)
+    )
+    return [(row, column) for row in rows for column in columns]
+
+
+def _sampled(scene: StillLife, camera: Camera, tile: Tile, samples: int) -> tuple[np.ndarray, Tensor | None]:
+    """Colour uint8 [h, w, 3], and depth [h, w] where one of the rays goes through the pixel centres, or None."""
     offsets = [(k + 0.5) / samples for k in range(samples)]
-    cast = {(u, v): _cast(scene, camera, rows, u, v) for u in offsets for v in offsets}
+    cast = {(u, v): _cast(scene, camera, tile, u, v) for u in offsets for v in offsets}
     shaded = torch.stack([color for color, _ in cast.values()]).mean(0)
     centers = cast.get((0.5, 0.5))
     color = (shaded.clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
@@ -282,30 +318,36 @@ def _sampled(scene: StillLife, camera: Camera, rows: slice, samples: int) -> tup
 
 
 def _cast(
-    scene: StillLife, camera: Camera, rows: slice, du: float, dv: float, shade: bool = True
+    scene: StillLife, camera: Camera, tile: Tile, du: float, dv: float, shade: bool = True
 ) -> tuple[Tensor, Tensor]:
-    """Colour [rows, W, 3] and depth [rows, W] along one ray per pixel of `rows`, at (column + du, row + dv).
+    """Colour [h, w, 3] and depth [h, w] along one ray per pixel of a tile, at (column + du, row + dv).
 
     Without `shade`, no colour is computed.
     """
     rotation = torch.from_numpy(camera.viewmat[:3, :3].astype(np.float32))
     eye = torch.from_numpy(camera.center.astype(np.float32))
-    x, y = camera.normalized(torch.arange(camera.width) + du, torch.arange(rows.start, rows.stop) + dv)
-    grid = torch.stack([x.expand(len(y), -1), y[:, None].expand(-1, len(x))], -1)
-    local = torch.cat([grid, torch.ones_like(grid[..., :1])], -1).reshape(-1, 3)
-    length = local.norm(dim=-1)
-    rays = (local @ rotation) / length[:, None]
+    rows, columns = tile
+    x, y = camera.normalized(
+        torch.arange(columns.start, columns.stop) + du, torch.arange(rows.start, rows.stop) + dv
+    )
+    shape = (len(y), len(x))
+    x, y = x.expand(shape).reshape(-1), y[:, None].expand(shape).reshape(-1)
+    length = (x * x + y * y + 1).sqrt()
+    # Each coordinate in a row of its own: all rays of one are read at a time.
+    rays = torch.stack([(a * x + b * y + c) / length for a, b, c in rotation.T.tolist()]).T
 
     dome = Sphere((0.0, 0.0, 0.0), _DOME_RADIUS, scene.dome, 1.0)
-    b = (eye * rays).sum(-1)
+    b = _dot(eye, rays)
     nearest = -b + (b * b - (eye @ eye - _DOME_RADIUS**2)).sqrt()  # from inside, the far root
     which = torch.full(nearest.shape, -1)
+    ends = [0, shape[1] - 1, -shape[1], -1]
     for k, solid in enumerate(scene.solids):
+        if not isinstance(solid, Disc) and _passed(solid, eye, rays[ends]):
+            continue
         t = solid.hit(eye, rays)
         closer = t < nearest
         nearest = torch.where(closer, t, nearest)
         which = torch.where(closer, k, which)
-    shape = (len(y), len(x))
     depth = (nearest / length).reshape(shape)
     if not shade:
         return torch.empty(0), depth
@@ -327,6 +369,33 @@ def _cast(
     return color.reshape(*shape, 3), depth
 
 
+def _passed(solid: Box | Sphere | Cylinder, eye: Tensor, corners: Tensor) -> bool:
+    """Whether all rays of a tile, whose corners are these rays [4, 3], pass by the sphere around a solid."""
+    middle = [sum(each) for each in zip(*corners.tolist(), strict=True)]
+    towards = [a - b for a, b in zip(solid.center, eye.tolist(), strict=True)]
+    distance = math.hypot(*towards)
+    if distance <= solid.reach:
+        return False
+    width = max(_angle(middle, corner) for corner in corners.tolist())
+    return _angle(middle, towards) > width + math.asin(solid.reach / distance) + _MARGIN
+
+
+def _angle(a: list[float], b: list[float]) -> float:
+    """Between two vectors, in radians."""
+    return math.acos(
+        max(-1.0, min(1.0, sum(x * y for x, y in zip(a, b, strict=True)) / (math.hypot(*a) * math.hypot(*b))))
+    )
+
+
+def _shades_none(solid: Box | Sphere | Cylinder, lowest: Tensor, highest: Tensor, light: Tensor) -> bool:
+    """Whether the sphere around a solid stands between the light and no point of a box with these corners."""
+    middle = [(a + b) / 2 for a, b in zip(lowest.tolist(), highest.tolist(), strict=True)]
+    towards = [a - b for a, b in zip(solid.center, middle, strict=True)]
+    reach = solid.reach + math.dist(lowest.tolist(), highest.tolist()) / 2 + _MARGIN
+    ahead = sum(a * b for a, b in zip(towards, light.tolist(), strict=True))
+    return bool(ahead < -reach or math.hypot(*towards) ** 2 - ahead**2 > reach**2)
+
+
 def _lit(
     scene: StillLife, surface: Solid, points: Tensor, normal: Tensor, rays: Tensor, albedo: Tensor
 ) -> Tensor:
@@ -335,13 +404,14 @@ def _lit(
     lambert = (normal @ light).clamp(min=0)
     start = points + 1e-3 * normal
     blocked = torch.zeros(len(points), dtype=torch.bool)
+    lowest, highest = start.amin(0), start.amax(0)
     for solid in scene.solids:
-        if not isinstance(solid, Disc):
-            blocked |= solid.hit(start, light.expand_as(start)) < _FAR
+        if not isinstance(solid, Disc) and not _shades_none(solid, lowest, highest, light):
+            blocked |= solid.hit(start, light) < _FAR
     sun = lambert * (~blocked)
     color = albedo * (_AMBIENT + (1 - _AMBIENT) * sun)[:, None]
     shine = getattr(surface, "shine", 0.0)
     if shine:
-        mirrored = rays - 2 * (rays * normal).sum(-1, keepdim=True) * normal
+        mirrored = rays - 2 * _dot(rays, normal)[:, None] * normal
         color = color + shine * ((mirrored @ light).clamp(min=0) ** 24 * sun)[:, None]
     return color

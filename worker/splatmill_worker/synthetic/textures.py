@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFilter
+from torch.nn import functional
 
 _PALETTE = np.array(
     [
@@ -50,17 +51,15 @@ class MipMap:
         x = uv[:, 0] * size - 0.5
         y = uv[:, 1] * size - 0.5
         x0, y0 = torch.floor(x), torch.floor(y)
-        fx, fy = (x - x0)[:, None], (y - y0)[:, None]
-        left, top = x0.long() % size, y0.long() % size
-        right, bottom = (left + 1) % size, (top + 1) % size
-        upper = torch.lerp(self._at(start, top, left, size), self._at(start, top, right, size), fx)
-        lower = torch.lerp(self._at(start, bottom, left, size), self._at(start, bottom, right, size), fx)
-        return torch.lerp(upper, lower, fy)
-
-    def _at(
-        self, start: torch.Tensor, row: torch.Tensor, column: torch.Tensor, size: torch.Tensor
-    ) -> torch.Tensor:
-        return self._texels[start + row * size + column]
+        right, lower = x - x0, y - y0
+        # Sizes are powers of two: the last bits of a number are its remainder.
+        last = size - 1
+        columns = x0.long() & last, (x0.long() + 1) & last
+        rows = (start + (row & last) * size for row in (y0.long(), y0.long() + 1))
+        texels = torch.stack([row + column for row in rows for column in columns], 1)
+        left, upper = 1 - right, 1 - lower
+        shares = torch.stack([upper * left, upper * right, lower * left, lower * right], 1)
+        return functional.embedding_bag(texels, self._texels, mode="sum", per_sample_weights=shares)
 
 
 def painted(rng: np.random.Generator, size: int, density: int) -> np.ndarray:
