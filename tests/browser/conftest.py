@@ -199,7 +199,16 @@ Open = Callable[..., Visit]
 
 
 @pytest.fixture
-def open_window(browser: Browser) -> Iterator[Open]:
+def pixels_per_unit() -> float:
+    """Pixels of the screen per pixel of CSS, along an axis: pages are laid out as ever, and drawing takes a quarter.
+
+    Files that compare what is drawn with other pictures have a fixture of their own.
+    """
+    return 0.5
+
+
+@pytest.fixture
+def open_window(browser: Browser, pixels_per_unit: float) -> Iterator[Open]:
     """Open windows whose pages are watched until the test ends."""
     visits: list[Visit] = []
     with ExitStack() as stack:
@@ -208,6 +217,7 @@ def open_window(browser: Browser) -> Iterator[Open]:
             base = address if isinstance(address, str) else str(address.http.base_url)
             settings: dict[str, Any] = {
                 "viewport": {"width": 1280, "height": 800},
+                "device_scale_factor": pixels_per_unit,
                 "reduced_motion": "reduce",
             }
             context = browser.new_context(base_url=base, **(settings | options))

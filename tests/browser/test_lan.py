@@ -103,7 +103,7 @@ def test_the_page_of_the_machine_itself_shows_the_code_for_phones(
     up: Up, open_window: Open, address: str, tmp_path: Path
 ) -> None:
     port = up.http.base_url.port
-    visit = open_window(f"https://127.0.0.1:{port}", ignore_https_errors=True)
+    visit = open_window(f"https://127.0.0.1:{port}", ignore_https_errors=True, device_scale_factor=1)
     visit.watched.allow("401")
     page = visit.page
     page.goto(f"/sign-in#key={key_of(up)}")

@@ -100,6 +100,12 @@ def psnr(a: npt.NDArray[np.float64], b: npt.NDArray[np.float64]) -> float:
 
 
 @pytest.fixture
+def pixels_per_unit() -> float:
+    """Pixel for pixel what the server renders."""
+    return 1.0
+
+
+@pytest.fixture
 def shown(visit: Visit, model: SmallModel) -> Page:
     assert mount(visit.page, model) == "webgl"
     return visit.page
