@@ -11,6 +11,7 @@ import os
 from pathlib import Path
 
 import numpy as np
+import pytest
 from PIL import Image
 from playwright.sync_api import Browser, Page, Route, expect
 
@@ -46,11 +47,12 @@ OPEN = """async (eye) => {
   camera.position.set(...eye).multiplyScalar(size).add(middle);
   camera.lookAt(middle);
   renderer.render(world, camera);
-  let triangles = 0, material;
+  let triangles = 0, material, textured;
   scene.traverse((each) => {
     if (each.isMesh) [triangles, material] = [triangles + each.geometry.index.count / 3, each.material.type];
+    if (each.isMesh) textured = each.material.map !== null;
   });
-  return { triangles, material, min: bounds.min.toArray(), max: bounds.max.toArray() };
+  return { triangles, material, textured, min: bounds.min.toArray(), max: bounds.max.toArray() };
 }"""
 
 
@@ -80,20 +82,31 @@ def opened(
     return found, Image.open(io.BytesIO(picture)).convert("RGB")
 
 
-def test_three_js_shows_a_mesh_upright_in_its_colours(browser: Browser, tmp_path: Path) -> None:
+@pytest.mark.parametrize("textured", [False, True])
+def test_three_js_shows_a_mesh_upright_in_its_colours(
+    browser: Browser, tmp_path: Path, textured: bool
+) -> None:
     # Two squares upright in the plane z = 1 of a world whose y points down: green above, red below.
     corners = np.array([[-1, -1, 1], [1, -1, 1], [1, 0, 1], [-1, 0, 1]], np.float32)
     vertices = np.concatenate([corners, corners + np.array([0, 1, 0], np.float32)])
     faces = np.array([[0, 2, 1], [0, 3, 2], [4, 6, 5], [4, 7, 6]], np.int32)
     colors = np.repeat(np.array([[30, 160, 60], [200, 40, 30]], np.uint8), 4, axis=0)
-    glb.write(tmp_path / "mesh.glb", Mesh(vertices, faces, colors), (0.0, 0.0, 0.0))
+    mesh = Mesh(vertices, faces, colors)
+    if textured:
+        # The first square shows the upper half of the texture, whose first row is at 0, and the second the lower half.
+        picture_of = np.repeat(colors[[0, 4]], 32 * 64, axis=0).reshape(64, 64, 3)
+        uvs = np.array([[0, 0], [1, 0], [1, 0.45], [0, 0.45]], np.float32)
+        mesh = Mesh(
+            vertices, faces, None, np.concatenate([uvs, uvs + np.array([0, 0.55], np.float32)]), picture_of
+        )
+    glb.write(tmp_path / "mesh.glb", mesh, (0.0, 0.0, 0.0))
     found, picture = opened(browser, (tmp_path / "mesh.glb").read_bytes(), (0.0, 0.0, 1.0))
-    assert (found["triangles"], found["material"]) == (4, "MeshBasicMaterial")
+    assert (found["triangles"], found["material"], found["textured"]) == (4, "MeshBasicMaterial", textured)
     assert (found["min"], found["max"]) == ([-1, -1, -1], [1, 1, -1])
     for row, expected in ((150, (30, 160, 60)), (210, (200, 40, 30))):
         shown = picture.getpixel((240, row))
         assert isinstance(shown, tuple)
-        assert max(abs(a - b) for a, b in zip(shown, expected, strict=True)) <= 2
+        assert max(abs(a - b) for a, b in zip(shown, expected, strict=True)) <= (4 if textured else 2)
 
 
 def test_a_mesh_is_made_by_its_button_saved_and_opened(
@@ -105,16 +118,20 @@ def test_a_mesh_is_made_by_its_button_saved_and_opened(
     section.get_by_role("button", name="Make a mesh").click()
     expect(section.get_by_role("status")).to_contain_text("There is no box yet")
     section.get_by_label("Only what lies in the box").uncheck()
-    section.get_by_label("Most triangles").select_option("100000")
-    section.get_by_role("button", name="Make a mesh").click()
+    section.get_by_label("Colours").select_option("2048")
+    expect(section.get_by_label("Most triangles")).to_have_value("100000")
+    with page.expect_request(f"**/v1/models/{model.id}/meshes") as asking:
+        section.get_by_role("button", name="Make a mesh").click()
+    assert asking.value.post_data_json == {"format": "glb", "faces": 100_000, "texture": 2048}
     expect(section.get_by_role("status")).to_contain_text("This takes some minutes")
     section.get_by_role("button", name="Stop").click()
     expect(section.get_by_role("status")).to_have_text("Stopped.")
     assert service.http.get(f"/v1/models/{model.id}/meshes").json()["meshes"] == []
+    section.get_by_label("Colours").select_option("of the corners")
     section.get_by_role("button", name="Make a mesh").click()
     save = section.get_by_role("link", name="Save .glb")
     expect(save).to_be_visible(timeout=WAIT)
-    expect(section.get_by_role("status")).to_be_empty()
+    expect(section.locator("[role=status]")).to_be_empty()
     if folder := os.environ.get("SPLATMILL_SCREENSHOTS"):
         section.screenshot(path=f"{folder}/mesh-section.png")
     with page.expect_download() as downloading:

@@ -12,6 +12,7 @@ import { follow } from "./kept.js";
  */
 
 const FACES = [100_000, 500_000, 2_000_000];
+const TEXTURES = [2048, 4096];
 
 /**
  * @param {HTMLElement} section
@@ -19,9 +20,11 @@ const FACES = [100_000, 500_000, 2_000_000];
  * @param {Stage} stage
  */
 export async function showMesh(section, { model, address }, stage) {
-  const format = h("select", { id: "mesh-format" },
+  const format = h("select", { id: "mesh-format", onchange: () => (colors.disabled = format.value !== "glb") },
     h("option", { value: "glb" }, ".glb, for Blender and the web"), h("option", { value: "ply" }, ".ply, for MeshLab and CloudCompare"));
   const faces = h("select", { id: "mesh-faces" }, FACES.map((count) => h("option", { value: count, selected: count === 500_000 }, number(count))));
+  const colors = h("select", { id: "mesh-colors", onchange: () => { if (colors.value) faces.value = String(FACES[0]); } },
+    h("option", { value: "" }, "of the corners"), TEXTURES.map((side) => h("option", { value: side }, `a texture of ${number(side)} pixels`)));
   const box = h("input", { type: "checkbox", id: "mesh-box" });
   const make = h("button", { type: "button", onclick: start }, "Make a mesh");
   const stop = h("button", { type: "button", class: "quiet", hidden: true }, "Stop");
@@ -39,7 +42,11 @@ export async function showMesh(section, { model, address }, stage) {
     }
     make.disabled = true;
     try {
-      await show(await send("POST", `${address}/meshes`, { format: format.value, faces: Number(faces.value), ...(box.checked ? { box: stage.edit.box } : {}) }));
+      await show(await send("POST", `${address}/meshes`, {
+        format: format.value, faces: Number(faces.value),
+        ...(colors.value && !colors.disabled ? { texture: Number(colors.value) } : {}),
+        ...(box.checked ? { box: stage.edit.box } : {}),
+      }));
     } catch (error) {
       refused(/** @type {Error} */ (error));
     } finally {
@@ -70,7 +77,7 @@ export async function showMesh(section, { model, address }, stage) {
     /** @type {any[]} */
     const meshes = (await get(`${address}/meshes`)).meshes;
     kept.replaceChildren(...meshes.filter(({ state }) => state === "succeeded").map((mesh) => {
-      const name = `.${mesh.request.format}, ${number(mesh.facts.triangles)} triangles${mesh.request.box ? " of a box" : ""}, ${bytes(mesh.bytes)}`;
+      const name = `.${mesh.request.format}, ${number(mesh.facts.triangles)} triangles${mesh.request.texture ? " with a texture" : ""}${mesh.request.box ? " of a box" : ""}, ${bytes(mesh.bytes)}`;
       return h("li", {},
         h("a", { class: "button quiet", href: mesh.links.file, download: `${model.name || model.id}-mesh.${mesh.request.format}` }, `Save ${name}`),
         h("button", { type: "button", class: "quiet", "aria-label": `Delete the mesh ${name}`, onclick: () => remove(mesh) }, "Delete"));
@@ -92,6 +99,7 @@ export async function showMesh(section, { model, address }, stage) {
     h("p", { class: "muted" }, "Triangles with colours, for programs that show no splats: the surfaces on which the photos agree."),
     h("div", { class: "row" },
       h("div", { class: "field" }, h("label", { for: "mesh-format" }, "File"), format),
+      h("div", { class: "field" }, h("label", { for: "mesh-colors" }, "Colours"), colors),
       h("div", { class: "field" }, h("label", { for: "mesh-faces" }, "Most triangles"), faces)),
     h("label", { class: "row", for: "mesh-box" }, box, "Only what lies in the box of Crop and clean"),
     h("div", { class: "row" }, make, stop), state, place, kept);
