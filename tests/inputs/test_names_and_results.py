@@ -10,6 +10,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 from splatmill.schema import Role
 from splatmill.transfer.local_capture import find_files
@@ -20,12 +21,21 @@ from tests.support.command_line import spawn
 pytestmark = pytest.mark.slow
 
 
+def smaller(photo: Path) -> None:
+    """Make a photo of 320 x 240 pixels: its features take half the time, and cameras are still recovered at once."""
+    with Image.open(photo) as whole:
+        small, exif = whole.resize((320, 240), Image.Resampling.LANCZOS), whole.getexif()
+    small.save(photo, quality=95, exif=exif)
+
+
 def test_photos_under_bad_names_train_and_the_results_among_them_are_no_photos(
     built: Build, tmp_path: Path
 ) -> None:
     folder = tmp_path / "photos"
     shutil.copytree(built("output-among-photos"), folder)
     names = sorted(os.listdir(os.fsencode(folder)))
+    for photo in folder.glob("*.jpg"):
+        smaller(photo)
     for bad, name in zip([b"x:1.jpg", b" lead.jpg", b"caf\xe9.jpg"], names[3::8], strict=False):
         os.rename(os.path.join(os.fsencode(folder), name), os.path.join(os.fsencode(folder), bad))
     options = ("--image-size", "160", "--steps", "10", "-v")

@@ -23,7 +23,7 @@ from tests.support.waiting import gone, wait_for
 pytestmark = pytest.mark.slow
 
 COUNT, WIDTH, HEIGHT = 10, 160, 120
-SMALL = {"max_gaussians": 2000}
+SMALL = {"max_gaussians": 2000, "lpips": "off"}
 
 
 @pytest.fixture(scope="module")

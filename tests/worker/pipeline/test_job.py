@@ -233,7 +233,7 @@ def test_far_from_the_origin_the_model_keeps_local_coordinates(tmp_path: Path) -
 
 @pytest.mark.skipif(not (DATA / "fox_540x960").is_dir(), reason="the shared photos are not on this machine")
 def test_real_photos_with_their_cameras(tmp_path: Path) -> None:
-    asked = TrainOptions.model_validate({"image_size": 160, "steps": 400})
+    asked = TrainOptions.model_validate({"image_size": 160, "steps": 400, "lpips": "off"})
     out = run(DATA / "fox_540x960", tmp_path / "work", asked)[0].out
     report = json.loads((out / "report.json").read_text())
     assert report["result"]["psnr"] > 23.0
@@ -243,7 +243,7 @@ def test_real_photos_with_their_cameras(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not (DATA / "lego_400").is_dir(), reason="the shared photos are not on this machine")
 def test_a_blender_set_with_alpha_and_its_own_split(tmp_path: Path) -> None:
-    asked = TrainOptions.model_validate({"image_size": 100, "steps": 400})
+    asked = TrainOptions.model_validate({"image_size": 100, "steps": 100, "lpips": "off"})
     out = run(DATA / "lego_400", tmp_path / "work", asked)[0].out
     report = json.loads((out / "report.json").read_text())
     assert report["facts"]["views"] == 100
