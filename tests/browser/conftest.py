@@ -35,6 +35,9 @@ FLAGS = [
 """Graphics in software, as there may be no GPU: WebGL by SwiftShader, and pages without it, which takes a fifth less of
 the processor. No sandbox, as tests may run as root in a container."""
 
+PATIENCE = 60_000
+"""Milliseconds that a page has for what it is asked, where a test says nothing else. What is quick ends no later."""
+
 REPORTS = """
 globalThis.policyReports = [];
 document.addEventListener("securitypolicyviolation", (event) => {
@@ -223,8 +226,8 @@ def open_window(browser: Browser, pixels_per_unit: float) -> Iterator[Open]:
             context = browser.new_context(base_url=base, **(settings | options))
             stack.callback(context.close)
             context.add_init_script(REPORTS)
-            context.set_default_timeout(20_000)
-            expect.set_options(timeout=20_000)
+            context.set_default_timeout(PATIENCE)
+            expect.set_options(timeout=PATIENCE)
             watched = Watched(urlsplit(base).netloc)
             context.on("page", watched.watch)
             visits.append(Visit(context.new_page(), context, watched))

@@ -115,7 +115,6 @@ def snapshots(page: Page, least: int) -> None:
     page.wait_for_function(
         "n => Number(document.querySelector('#live .box[data-snapshots]')?.dataset.snapshots ?? 0) >= n",
         arg=least,
-        timeout=60_000,
         polling=100,
     )
 
@@ -161,7 +160,7 @@ def test_the_scene_is_watched_while_it_trains(service: Up, capture: str, open_wi
     assert seen(page).std() > 0.05
     page.get_by_role("button", name="Cancel").click()
     page.get_by_role("button", name="Cancel the job").click()
-    expect(page.locator("#state")).to_have_text("Cancelled", timeout=60_000)
+    expect(page.locator("#state")).to_have_text("Cancelled")
 
 
 def test_a_whole_job_is_watched_from_its_beginning_to_its_model(
@@ -177,7 +176,7 @@ def test_a_whole_job_is_watched_from_its_beginning_to_its_model(
     )
     snapshots(page, 1)
 
-    expect(page.locator("#state")).to_have_text("Finished", timeout=60_000)
+    expect(page.locator("#state")).to_have_text("Finished")
     assert page.evaluate("notified") == ["watched: Finished."]
     expect(page.locator("#left")).to_be_empty()
     link = page.get_by_role("link", name="Open the model")
@@ -245,18 +244,18 @@ def test_a_queued_job_says_its_place_and_a_job_is_cancelled_by_keyboard(
     page.goto(f"/jobs/{running}")
     picture = page.get_by_role("img", name="The scene in training")
     expect(picture).to_be_visible(timeout=60_000)
-    expect(page.locator("#live .caption")).to_contain_text("WebGL", timeout=30_000)
+    expect(page.locator("#live .caption")).to_contain_text("WebGL")
     for job_id in (waiting, running):
         page.goto(f"/jobs/{job_id}")
         page.get_by_role("button", name="Cancel").press("Enter")
         page.get_by_role("button", name="Cancel the job").press("Enter")
-        expect(page.locator("#state")).to_have_text("Cancelled", timeout=30_000)
+        expect(page.locator("#state")).to_have_text("Cancelled")
         expect(page.get_by_role("button", name="Restart")).to_be_visible()
         assert service.job(job_id)["state"] == "cancelled"
 
     service.http.delete(f"/v1/jobs/{waiting}").raise_for_status()
     relay.mend()
-    expect(cut_off.page.locator("#outcome")).to_contain_text(waiting, timeout=60_000)
+    expect(cut_off.page.locator("#outcome")).to_contain_text(waiting)
     expect(cut_off.page.get_by_role("button", name="Cancel")).to_have_count(0)
     asked: list[str] = []
     cut_off.page.on("request", lambda request: asked.append(request.url))
@@ -275,7 +274,7 @@ def test_a_failed_job_says_why_and_what_to_do(service: Up, visit: Visit) -> None
     asked = {"capture": capture, "options": options}
     job_id = service.http.post("/v1/jobs", json=asked).json()["id"]
     page.goto(f"/jobs/{job_id}")
-    expect(page.locator("#state")).to_have_text("Failed", timeout=60_000)
+    expect(page.locator("#state")).to_have_text("Failed")
     expect(page.get_by_role("heading", name="Log", exact=True)).to_be_visible()
     for name in ("Live view", "Error against time"):
         expect(page.get_by_role("heading", name=name)).to_be_hidden()
@@ -309,12 +308,12 @@ def test_a_lost_connection_is_shown_and_the_page_goes_on_where_it_was(
     )
     job_id = submit(service, capture, time_budget="6s")
     page.goto(f"/jobs/{job_id}")
-    expect(page.locator("#stages [data-status=now]")).to_contain_text("Training", timeout=60_000)
+    expect(page.locator("#stages [data-status=now]")).to_contain_text("Training")
     relay.cut()
     expect(page.locator("#lost")).to_be_visible()
     service.ended(job_id)
     relay.mend()
-    expect(page.locator("#state")).to_have_text("Finished", timeout=30_000)
+    expect(page.locator("#state")).to_have_text("Finished")
     expect(page.locator("#lost")).to_have_count(0)
     rows = service.http.get(f"/v1/jobs/{job_id}/curve").json()["rows"]
     expect(page.locator("#curve tbody tr")).to_have_count(len(rows))

@@ -20,7 +20,7 @@ from tests.support.paths import ROOT
 from tests.support.programs import npm_package
 from tests.support.up import Up
 
-WAIT = 20_000
+WAIT = 60_000
 """Milliseconds to wait for what the renderer answers, which other tests may keep busy."""
 
 

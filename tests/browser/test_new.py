@@ -29,7 +29,7 @@ from tests.support.panoramas import gpano, striped
 from tests.support.programs import npm_package
 from tests.support.up import Up
 
-CHECKED = 30_000
+CHECKED = 60_000
 """Milliseconds that the photos of a test may take to be checked on a busy machine."""
 
 

@@ -15,7 +15,7 @@ from tests.browser.conftest import Open, SmallModel, Visit
 from tests.support.up import Up
 from tests.support.waiting import wait_for
 
-WAIT = 20_000
+WAIT = 60_000
 PHONE = {"viewport": {"width": 390, "height": 780}, "has_touch": True, "is_mobile": True}
 
 

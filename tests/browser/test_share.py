@@ -99,7 +99,7 @@ def test_a_link_shows_the_scene_and_its_files(
     assert sum(loaded) < 600_000
     expect(visit.page.locator(".view .said")).to_be_empty()
     # A frame that was drawn is shown a moment later.
-    wait_for(lambda: -10 * np.log10(np.square(picture(visit.page) - poster).mean()) > 25, seconds=20)
+    wait_for(lambda: -10 * np.log10(np.square(picture(visit.page) - poster).mean()) > 25)
     assert not [url for url in asked if url.endswith("/model.ply")]
     session.detach()
     expect(visit.page.get_by_role("heading", level=1)).to_have_text("still life")

@@ -105,7 +105,7 @@ def test_a_redis_that_comes_back_empty_loses_no_job_and_no_attempt(own_service: 
     def noted() -> bool:
         return own_service.data.joinpath("storage", layout.job_log(done)).is_file()
 
-    wait_for(noted, 30)
+    wait_for(noted)
     with own_service.redis() as connection:
         connection.flushall()
     listed = own_service.http.get("/v1/jobs").json()["jobs"]

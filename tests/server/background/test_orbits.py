@@ -112,7 +112,7 @@ def test_a_video_waits_while_storage_is_listed_for_the_first_time(
     # Redis loses the last scan while another process makes a new one.
     app.service.redis.set(keys.SCAN_LOCK, "another process", ex=60)
     app.service.redis.delete(keys.SCAN)
-    wait_for(lambda: app.service.orbits._failures, 20)
+    wait_for(lambda: app.service.orbits._failures)
     app.service.redis.delete(keys.SCAN_LOCK)
     assert ended(app, found["id"])["state"] == "succeeded"
 

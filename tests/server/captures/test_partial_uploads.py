@@ -437,12 +437,12 @@ def test_counting_the_uploads_of_one_capture_holds_up_no_other(
         slow = pool.submit(one_more, full)
         try:
             assert counting.wait(10)
-            pool.submit(one_more, other).result(timeout=10)
+            pool.submit(one_more, other).result(timeout=60)
             assert not slow.done()
         finally:
             proceed.set()
         with pytest.raises(ProblemError, match="2 uploads that are not complete"):
-            slow.result(timeout=10)
+            slow.result(timeout=60)
 
 
 def test_a_capture_has_a_limited_number_of_unfinished_uploads(
