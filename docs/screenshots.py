@@ -93,7 +93,7 @@ def walk(pages: dict[str, Page], http: httpx.Client, photos: list[Path]) -> None
     job = start(http, photos)
     for theme, page in pages.items():  # one after the other: each draws in software while the job trains
         page.goto(f"/jobs/{job}")
-        page.get_by_text("Snapshot at step").wait_for(timeout=600_000)
+        page.get_by_text("The scene after").wait_for(timeout=600_000)
         page.wait_for_timeout(4000)
         take(page, f"job-{theme}")
         page.goto("about:blank")
