@@ -257,6 +257,19 @@ def with_test_set(folder: Path) -> None:
     transforms(folder / "transforms_test.json", frames()[:2])
 
 
+def posed_with_small(folder: Path) -> None:
+    photos(folder / "images")
+    transforms(folder / "transforms.json")
+    Image.new("RGB", (16, 12)).save(folder / "images" / NAMES[5])
+
+
+def posed_beside_zip(folder: Path) -> None:
+    with tempfile.TemporaryDirectory() as name:
+        photos(Path(name) / "images")
+        zip_of(Path(name), folder / "images.zip")
+    transforms(folder / "transforms.json")
+
+
 def posed_with_broken(folder: Path) -> None:
     photos(folder / "images")
     transforms(folder / "transforms.json")
@@ -379,6 +392,8 @@ EXAMPLES: tuple[Example, ...] = (
     Example("Cameras", "the photos in images_2 and images_4", two_sizes, "used with a remark"),
     Example("Cameras", "names of a model in the code page 1251", of_code_page, "used with a remark"),
     Example("Cameras", "one photo without a camera", no_camera, "used with a remark"),
+    Example("Cameras", "one photo of twelve has 16 x 12 pixels", posed_with_small, "used with a remark"),
+    Example("Cameras", "transforms.json beside a zip of its photos", posed_beside_zip, "refused"),
     Example("Cameras", "one photo of twelve is cut off", posed_with_broken, "used with a remark"),
     Example("Cameras", "a model of photos with other names", other_names, "refused"),
     Example(

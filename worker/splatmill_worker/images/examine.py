@@ -65,6 +65,13 @@ class Picture:
     kind: Kind = ""
 
 
+def too_small(width: int, height: int) -> str | None:
+    """Why a photo with so many pixels is not used; None for a larger one."""
+    if min(width, height) >= MIN_PHOTO_SIDE:
+        return None
+    return f"it has {width} x {height} pixels, which is too small: each side needs at least {MIN_PHOTO_SIDE}"
+
+
 def examine(path: Path, name: str) -> Picture | str:
     """The picture, decoded once to its end, or the reason why the file cannot be used; errors call it `name`."""
     try:
@@ -72,11 +79,8 @@ def examine(path: Path, name: str) -> Picture | str:
             warnings.simplefilter("ignore")  # Pillow warns of broken EXIF, with which a photo is usable
             with guarded.opened(path) as image:
                 width, height = image.size
-                if min(width, height) < MIN_PHOTO_SIDE:
-                    return (
-                        f"it has {width} x {height} pixels, which is too small: each side needs at least "
-                        f"{MIN_PHOTO_SIDE}"
-                    )
+                if (small := too_small(width, height)) is not None:
+                    return small
                 width, height = upright_size(image)
                 several = guarded.several(image)
                 colors = PhotoColors.of(image, tags(image), path).remark(image.mode)
@@ -97,10 +101,10 @@ def examine(path: Path, name: str) -> Picture | str:
                     sphere = panoramas.by_edges(photo if turn is None else photo.transpose(turn))
                 alpha = transparency.extent(photo)
                 kind = kind_of(mode, photo)
-                small = small_grey(photo)
-                small = small if turn is None else np.asarray(Image.fromarray(small).transpose(turn))
+                grey = small_grey(photo)
+                grey = grey if turn is None else np.asarray(Image.fromarray(grey).transpose(turn))
     except UnusablePicture as error:
         return error.reason + (GIVE if error.reason == guarded.UNKNOWN else "")
     except OSError as error:
         return f"it cannot be read: {plain(error)}"
-    return Picture(width, height, found, several, colors, small, sphere, alpha, kind)
+    return Picture(width, height, found, several, colors, grey, sphere, alpha, kind)

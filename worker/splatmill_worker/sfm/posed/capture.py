@@ -24,6 +24,7 @@ from splatmill_worker.errors import UnusablePicture
 from splatmill_worker.images import lens, mask_levels, transparency
 from splatmill_worker.images.decoding import decoders
 from splatmill_worker.images.decoding.decoders import mask_fault, photo_colors
+from splatmill_worker.images.examine import too_small
 from splatmill_worker.images.masks import unfit
 from splatmill_worker.images.photo_colors import sentences
 from splatmill_worker.images.prepare import names_remark
@@ -180,7 +181,7 @@ def _unused(names: Sequence[str], cameras: Cameras) -> tuple[str, ...]:
 
 
 def _decoded(scene: Scene) -> Scene:
-    """The scene without photos that do not decode, or are wholly transparent, and with a warning about opaque ones
+    """The scene without photos that do not decode, are too small or wholly transparent, and a warning about opaque ones
     among cut-outs."""
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         alphas = list(pool.map(_alpha, scene.views))
@@ -209,7 +210,7 @@ def _decoded(scene: Scene) -> Scene:
 def _alpha(view: View) -> transparency.Extent | str:
     """The extent of a photo, or why it cannot be used."""
     try:
-        return decoders.alpha(view.image)
+        return too_small(view.camera.width, view.camera.height) or decoders.alpha(view.image)
     except UnusablePicture as error:
         return error.reason
     except OSError as error:

@@ -15,7 +15,7 @@ from typing import Literal
 from splatmill.data_sets import walk
 from splatmill.schema.files.masks import masks_beside, paired, without_mask_folder
 from splatmill.schema.files.names import UnsafeName, readings, storable_name
-from splatmill.schema.files.photos import PHOTO_SUFFIXES
+from splatmill.schema.files.photos import ARCHIVE_SUFFIXES, PHOTO_SUFFIXES, VIDEO_SUFFIXES
 from splatmill.schema.quantities import counted
 from splatmill_worker.errors import Refusal, UnusablePicture
 from splatmill_worker.images.decoding import decoders
@@ -229,7 +229,10 @@ def alternatives(name: str, files: ImageFiles) -> str:
 
 
 def instead(files: ImageFiles) -> str:
-    """A photo that there is, as a part of a sentence."""
+    """A photo that there is, or a video or zip, as a part of a sentence."""
+    whole = [path for path in walk(files.root) if path.lower().endswith((*VIDEO_SUFFIXES, *ARCHIVE_SUFFIXES))]
+    if whole and not files.photos:
+        return f", but {whole[0]}: cameras are read where photos lie beside them, or in one zip with them"
     return "".join(f": a photo of it is {name!r}" for name in list(files.photos)[:1])
 
 
