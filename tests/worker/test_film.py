@@ -24,7 +24,7 @@ GREY = np.full((16, 32, 3), 128, np.uint8)
 
 def progress(folder: Path, *, anew: bool = False) -> ProgressFilm:
     """A film that is only written; the view and the plan, which are for taking shots, are absent."""
-    return ProgressFilm(folder, cast(TrainingView, None), cast(Plan, None), anew=anew)
+    return ProgressFilm(folder, cast(TrainingView, None), cast(Plan, None), None, anew=anew)
 
 
 def test_a_film_appears_when_it_is_complete(tmp_path: Path) -> None:

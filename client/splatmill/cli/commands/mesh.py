@@ -45,7 +45,7 @@ def mesh(
             metavar="PIXELS",
             help="Longest side of a texture, of a .glb. Left out, each vertex has a colour instead.",
             min=256,
-            max=8192,
+            max=4096,
             show_default=False,
         ),
     ] = None,

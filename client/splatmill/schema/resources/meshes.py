@@ -33,7 +33,7 @@ class MeshRequest(Request):
     texture: int | None = Field(
         default=None,
         ge=256,
-        le=8192,
+        le=4096,
         description="Longest side of a texture in pixels, of a .glb. Left out, each vertex has a colour instead.",
     )
 
