@@ -131,6 +131,12 @@ def test_the_view_stays_in_sight_while_the_scene_is_cropped(phone: Visit) -> Non
     assert button["y"] + button["height"] <= 780
 
 
+def test_a_tool_is_brought_into_sight_when_it_is_opened(phone: Visit) -> None:
+    page = phone.page
+    page.get_by_role("button", name="Measure").tap()
+    expect(page.get_by_role("heading", name="Measure", exact=True)).to_be_in_viewport()
+
+
 def test_downloads_can_be_read_on_a_phone(phone: Visit) -> None:
     page = phone.page
     section = page.locator("#downloads")

@@ -16,7 +16,7 @@ from splatmill_worker.mesh.triangles import Mesh
 PADDING = 4
 """Texels between two charts: programs show textures reduced, which mixes neighbouring texels."""
 
-AT_ONCE = 1 << 21
+AT_ONCE = 1 << 19
 """Texels that are tried at a time; each takes about 100 bytes."""
 
 Floats = npt.NDArray[np.float32]

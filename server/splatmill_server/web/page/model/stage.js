@@ -66,6 +66,9 @@ export class Stage {
       this.visitors.button,
       h("button", { type: "button", onclick: () => void this.savePicture() }, "Save a picture"),
       document.fullscreenEnabled ? h("button", { type: "button", class: "push", onclick: () => void byId("viewer").requestFullscreen() }, "Full screen") : "");
+    for (const { button, panel } of [this.measure, this.annotate, this.edit, this.path, this.visitors]) {
+      button.addEventListener("click", () => !panel.hidden && panel.scrollIntoView({ block: "nearest" })); // on phones it lies below
+    }
     byId("panels").append(this.scale, this.measure.panel, this.annotate.panel, this.edit.panel, this.path.panel, this.visitors.panel);
   }
 
