@@ -275,13 +275,13 @@ def test_the_preview_of_a_raw_photo_is_no_photo(photos: Path, tmp_path: Path) ->
     picture(256, 192).save(photos / "IMG_1.DNG", "TIFF")
     with zipfile.ZipFile(photos / "more.zip", "w") as archive_file:
         archive_file.write(photos / "IMG_1.DNG", "2.nef")
-        archive_file.writestr("sfm/model.nvm", "NVM_V3")
+        archive_file.writestr("sfm/scene.mvs", "MVSI")
     result = prepared(photos, tmp_path)
     assert [photo.name for photo in result.photos] == ["a.jpg"]
     assert reasons(result)["IMG_1.DNG"] == reasons(result)["more/2.nef"] == "raw photos are not read"
     raw, cameras = result.warnings
     assert "raw photos: IMG_1.DNG and 1 more. Develop them as JPEG or TIFF" in raw
-    assert "cameras of VisualSFM in more/sfm/model.nvm are not read" in cameras
+    assert "cameras of OpenMVS in more/sfm/scene.mvs are not read" in cameras
 
 
 def test_a_photo_that_disappeared_is_left_out(tmp_path: Path) -> None:

@@ -99,11 +99,14 @@ def test_what_is_planted_goes(life: Trained, kind: Reason) -> None:
 
 @pytest.mark.slow
 def test_what_photos_support_stays(life: Trained) -> None:
-    """Of the Gaussians that training left, those that go are ones that the photos are better without."""
+    """Of the Gaussians that training left, those that go are ones that the photos are better without.
+
+    Held-out photos decide nothing, and may lose a little.
+    """
     found = life.cleaned(life.gaussians)
     gone = ~found.keep
     assert found.psnr >= found.psnr_before
-    assert life.psnr(life.gaussians.select(found.keep)) >= life.psnr(life.gaussians) - 0.02
+    assert life.psnr(life.gaussians.select(found.keep)) >= life.psnr(life.gaussians) - 0.05
     evidence = evidence_of(life.gaussians, life.photos, BLACK)
     heavy = evidence.support > 0.1 * evidence.support.max()
     assert int(heavy.sum()) > 10

@@ -50,7 +50,5 @@ def write_plan(path: Path, options: TrainOptions, plan: Plan) -> None:
 
 
 def _same(stored: dict[str, Any], options: TrainOptions) -> bool:
-    default = TrainOptions().model_dump(mode="json")
-    return all(
-        stored.get(name, default[name]) == value for name, value in options.model_dump(mode="json").items()
-    )
+    known = {name: value for name, value in stored.items() if name in TrainOptions.model_fields}
+    return TrainOptions.model_validate(known).model_dump() == options.model_dump()
