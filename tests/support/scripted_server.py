@@ -62,13 +62,13 @@ class ScriptedServer:
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:
             head = (await reader.readuntil(b"\r\n\r\n")).decode()
+            first, *lines = head.strip().split("\r\n")
+            method, path, _ = first.split(" ")
+            headers = {name.lower(): value.strip() for name, value in (line.split(":", 1) for line in lines)}
+            body = await reader.readexactly(int(headers.get("content-length", 0)))
         except (asyncio.IncompleteReadError, ConnectionError):
-            writer.close()  # it was opened, and closed without a request
+            writer.close()  # it was closed before there was a whole request
             return
-        first, *lines = head.strip().split("\r\n")
-        method, path, _ = first.split(" ")
-        headers = {name.lower(): value.strip() for name, value in (line.split(":", 1) for line in lines)}
-        body = await reader.readexactly(int(headers.get("content-length", 0)))
         request = Seen(method, path, headers, body)
         self.seen.append(request)
         answer = self.answer(request)
