@@ -7,7 +7,6 @@ Not proved here: what phones warn of, and a network with several machines in it.
 from __future__ import annotations
 
 import io
-import json
 import os
 import ssl
 import subprocess
@@ -25,9 +24,8 @@ from splatmill_server.up import lan
 from splatmill_server.up.certificate import certificate
 from splatmill_server.up.folder import UpError
 from tests.browser.conftest import Open
-from tests.browser.test_new_phone import WEB
 from tests.support.axe import violations
-from tests.support.programs import node
+from tests.support.qr_code import read_code
 from tests.support.up import Up
 
 
@@ -49,19 +47,6 @@ def up(address: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Up]:
 
 def key_of(up: Up) -> str:
     return (up.data / "lan" / "key").read_text().strip()
-
-
-def read_code(picture: Image.Image, folder: Path) -> str:
-    """The text of a QR code in a picture."""
-    (folder / "pixels").write_bytes(picture.tobytes())
-    program = f"""
-        import decodeQR from "qr/decode.js"; import fs from "node:fs";
-        const data = new Uint8Array(fs.readFileSync({json.dumps(str(folder / "pixels"))}));
-        console.log(decodeQR({{ width: {picture.width}, height: {picture.height}, data }}));"""
-    command = [*node("qr"), "--input-type=module", "-e", program]
-    done = subprocess.run(command, cwd=WEB, capture_output=True, text=True, timeout=60)
-    assert done.stdout, done.stderr
-    return done.stdout.strip()
 
 
 def test_other_devices_need_https_the_certificate_and_the_key(up: Up, address: str) -> None:

@@ -6,8 +6,6 @@ Not proved here: a phone's own camera dialogue.
 from __future__ import annotations
 
 import io
-import json
-import subprocess
 from pathlib import Path
 
 from PIL import Image
@@ -15,11 +13,8 @@ from playwright.sync_api import Page, expect
 
 from tests.browser.conftest import Open
 from tests.browser.test_new import opened
-from tests.support.paths import ROOT
-from tests.support.programs import node
+from tests.support.qr_code import read_code
 from tests.support.up import Up
-
-WEB = ROOT / "server" / "web"
 
 
 def test_a_phone_takes_photos_one_by_one(
@@ -53,14 +48,7 @@ def test_the_code_for_phones_can_be_read(page: Page, tmp_path: Path) -> None:
     }"""
     assert page.evaluate(script, address) == [True, True, True, False, False]
     picture = Image.open(io.BytesIO(page.locator("svg.qr").screenshot())).convert("RGBA")
-    (tmp_path / "pixels").write_bytes(picture.tobytes())
-    program = f"""
-        import decodeQR from "qr/decode.js"; import fs from "node:fs";
-        const data = new Uint8Array(fs.readFileSync({json.dumps(str(tmp_path / "pixels"))}));
-        console.log(decodeQR({{ width: {picture.width}, height: {picture.height}, data }}));"""
-    command = [*node("qr"), "--input-type=module", "-e", program]
-    done = subprocess.run(command, cwd=WEB, capture_output=True, text=True, timeout=60)
-    assert done.stdout.strip() == address, done.stderr
+    assert read_code(picture, tmp_path) == address
 
 
 def test_without_the_packages_a_phone_is_told_the_address(page: Page) -> None:
