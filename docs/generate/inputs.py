@@ -28,7 +28,7 @@ from splatmill_worker.readers import scan
 from splatmill_worker.readers.colmap_files import MODELS
 from splatmill_worker.readers.programs.shots import MAX_LENGTH_ERROR
 from splatmill_worker.scene import MIN_SHOWN
-from splatmill_worker.sfm.posed import colmap_model, model_files, points, polycam, triangulation
+from splatmill_worker.sfm.posed import colmap_model, model_files, points, polycam, same_bytes, triangulation
 from tests.support.inputs.example import answer
 from tests.support.inputs.table import EXAMPLES
 
@@ -208,7 +208,10 @@ def _cameras() -> list[str]:
         are held out, and those of the validation set left out, unless they are also for training. Other files
         `transforms*.json` are read only where there is no `transforms.json`. A photo that is named several times has
         one camera: where the cameras agree, any of them; where they differ, the photo is left out, and both are named.
-        If those are more than {model_files.MOST_FAULTY:.0%} of the photos, the job fails.
+        If those are more than {model_files.MOST_FAULTY:.0%} of the photos, the job fails. Photos of the same bytes with
+        different cameras are left out too, since at most one of the cameras can be right, and a warning names them; if
+        they are more than {same_bytes.MOST_CONTRADICTED:.0%} of the photos, the job fails. Photos of one colour are
+        kept.
 
         A photo is found by the name that its camera gives. Where none has it, the photo is the one that agrees in the
         last parts of its path, with `/` or `\\` between folders, in another case, form of accents or suffix, if it is

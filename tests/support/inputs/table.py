@@ -285,6 +285,13 @@ def two_cameras(numbers: Sequence[int], folder: Path) -> None:
     transforms(folder / "transforms.json", frames() + again)
 
 
+def same_bytes(numbers: Sequence[int], folder: Path) -> None:
+    """Photos of noise, of which those with these numbers have the bytes of the first."""
+    for seed, name in enumerate(NAMES):
+        _noise(folder / "images" / name, 0 if seed in numbers else seed)
+    transforms(folder / "transforms.json")
+
+
 def float_tiff(folder: Path) -> None:
     plain(folder)
     tags = ((258, 32), (277, 3), (339, 3))
@@ -403,6 +410,18 @@ EXAMPLES: tuple[Example, ...] = (
     Example("Cameras", "transforms_test.json beside transforms.json", with_test_set, "used"),
     Example(
         "Cameras", "one photo of twelve with two cameras", partial(two_cameras, (3,)), "used with a remark"
+    ),
+    Example(
+        "Cameras",
+        "two photos of twelve with the same bytes and different cameras",
+        partial(same_bytes, (7,)),
+        "used with a remark",
+    ),
+    Example(
+        "Cameras",
+        "eight photos of twelve with the same bytes and different cameras",
+        partial(same_bytes, range(8)),
+        "refused",
     ),
     Example("Cameras", "two photos of twelve with two cameras", partial(two_cameras, (3, 5)), "refused"),
     Example("Cameras", "one mirrored pose of twelve", with_frames(_set(MIRRORED, 5)), "used with a remark"),

@@ -17,6 +17,7 @@ from splatmill_worker.images.copies import SMALL_SIDE, SmallPicture, is_copy, sm
 from splatmill_worker.images.decoding import decoders
 from splatmill_worker.images.faces import faces_of, is_panorama
 from splatmill_worker.scene import Float, Scene, View, looked_at
+from splatmill_worker.sfm.posed.same_bytes import ONE_CAMERA
 
 PARALLAX = 0.003
 """Median shift of the scene between the places of two photos up to which they are near copies, as a share of the longer
@@ -29,7 +30,7 @@ OVERLAP = 0.8
 ONE_PLACE = PARALLAX / 3.0
 """Shift up to which two photos were taken from one place: a third of what slow steps leave between two frames."""
 
-BESIDE = 0.05
+BESIDE = ONE_CAMERA
 """Shift up to which photos are compared by content: cameras that were recovered for each of two copies differ by less,
 and round a thing that looks alike from several sides, photos differ by more."""
 

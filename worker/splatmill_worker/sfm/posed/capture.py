@@ -32,6 +32,7 @@ from splatmill_worker.scene import Scene, Source, View, without
 from splatmill_worker.sfm.posed import colmap_model, parts, programs, transforms
 from splatmill_worker.sfm.posed.files import ImageFiles, none_usable
 from splatmill_worker.sfm.posed.programs import ProgramCameras
+from splatmill_worker.sfm.posed.same_bytes import without_contradicted
 from splatmill_worker.wording import plain
 
 POSE_FOLDERS = ("poses", "")
@@ -63,8 +64,8 @@ class PosedInput:
         """The scene with the cameras as they were given.
 
         `left_out` of the scene lists cameras whose photo is missing, and photos without a camera. Raises ValueError,
-        naming the file and the fault, when no usable view is left, UnusablePicture for a mask that is too large, and
-        Refusal where the masks hide all of every photo.
+        naming the file and the fault, when no usable view is left, or most have photos of the same bytes,
+        UnusablePicture for a mask that is too large, and Refusal where the masks hide all of every photo.
         """
         files = ImageFiles.under(self.directory)
         if self.models:
@@ -73,7 +74,7 @@ class PosedInput:
             scene = programs.load(self.program, files, self.notes)
         else:
             scene = transforms.load(self.transforms, self.source, files, self.directory, self.notes)
-        scene = _decoded(_without_unfit_masks(scene))
+        scene = without_contradicted(_decoded(_without_unfit_masks(scene)))
         masks = [view.mask for view in scene.views if view.mask is not None]
         unused = {name for name in files.unused_masks if files.masks[name] not in masks}
         judged = mask_levels.judged({view.name: view.mask for view in scene.views}, unused)
