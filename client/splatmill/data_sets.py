@@ -45,6 +45,7 @@ PROGRAM_FILES = {
     "OpenSfM, OpenDroneMap": ("reconstruction.json",),
     "Bundler": ("*.out",),
     "VisualSFM": ("*.nvm",),
+    "3D Gaussian Splatting (Inria's, and trainers like it)": ("cameras.json",),
     "Record3D": ("metadata.json", "metadata"),
 }
 """Other programs whose cameras are read, with patterns of the names, in lower case, of their files.
@@ -64,7 +65,7 @@ CAMERA_PROGRAMS = {
 
 OTHER_CAMERAS = {
     "OpenDroneMap": ("shots.geojson",),
-    "Metashape (its project)": ("*.psx",),
+    "Metashape (its project)": ("*.psx", "*.psz"),
     "OpenMVG": ("sfm_data.json", "sfm_data.bin"),
     "Meshroom": ("*.sfm",),
     "Bundler (with another lens)": ("*.rd",),
@@ -72,14 +73,22 @@ OTHER_CAMERAS = {
     "OpenMVS": ("*.mvs",),
     "LLFF": ("poses_bounds.npy",),
     "RealityScan, RealityCapture (their project)": ("*.rsproj", "*.rcproj"),
-    "Pix4D": ("*_calibrated_*.txt",),
+    "Pix4D": ("*_calibrated_*.txt", "*.p4d"),
     "MVSNet": ("*_cam.txt",),
     "7-Scenes": ("*.pose.txt",),
     "TUM RGB-D": ("groundtruth.txt",),
     "Replica": ("traj.txt",),
     "NeuS, DTU": ("cameras.npz", "cameras_sphere.npz"),
+    "NSVF, SRN, ScanNet": ("pose/*.txt", "intrinsics.txt"),
+    "Nerfies, HyperNeRF": ("camera/*.json",),
+    "ARKitScenes": ("*.traj", "*.pincam"),
+    "3D Scanner App": ("frame_*.json",),
+    "Tanks and Temples, Open3D": ("*_sfm.log", "trajectory.log"),
+    "KITTI": ("poses.txt",),
 }
-"""Programs whose cameras are not read, with patterns of the names, in lower case, of their files."""
+"""Programs whose cameras are not read, with patterns of the names, in lower case, of their files; some have a folder.
+
+A file that has cameras only beside others, as `intrinsics.txt`, stands for these."""
 
 LARGE = ("*.mvs",)
 """Patterns of OTHER_CAMERAS whose files hold points or photos too, so that they are not sent to be named by the job."""
@@ -219,16 +228,16 @@ def named_by_job(names: Sequence[str]) -> list[str]:
 
 
 def fits(name: str, patterns: Sequence[str]) -> bool:
-    """Whether the last part of a name fits one of some patterns in lower case."""
-    base = _split(name)[1].lower()
-    return any(fnmatchcase(base, pattern) for pattern in patterns)
+    """Whether the last parts of a name, as many as a pattern has, fit one of some patterns in lower case."""
+    parts = name.lower().split("/")
+    return any(fnmatchcase("/".join(parts[-1 - pattern.count("/") :]), pattern) for pattern in patterns)
 
 
 def is_camera_file(name: str) -> bool:
     """Whether a file of this name, without a folder, holds cameras or a part of them."""
     base = name.lower()
     return base in (*MODEL_PARTS, "points3d.bin", "points3d.txt", "database.db") or fits(
-        name, (TRANSFORMS, "reconstruction.json")
+        name, (TRANSFORMS, "reconstruction.json", "cameras.json")
     )
 
 

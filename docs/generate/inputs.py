@@ -127,7 +127,7 @@ def _photos() -> list[str]:
             ["what", "suffixes", "what to do"],
             [[kind.what, choices(kind.suffixes), kind.advice] for kind in UNREAD_KINDS],
         ),
-        f"""Results of Splatmill among the photos are not read as photos: the files {choices(OUTPUT_MEDIA)} in a folder
+        f"""Results of Splatmill among the photos are not read: the files {choices(OUTPUT_MEDIA)} in a folder
         with two of {choices(OUTPUT_MARKS)}.""",
         "### Pictures that are no photos\n",
         table(
@@ -241,6 +241,9 @@ def _cameras() -> list[str]:
 
         - **VisualSFM**, as COLMAP writes it too: `.nvm` of the versions NVM_V3 and NVM_V3_R9T, with its points; a
         calibration of all photos (FixedK) is refused. Of several models, the one with the most photos is used.
+
+        - **3D Gaussian Splatting**, of Inria and trainers like it: the `cameras.json` of a trained model, beside its
+        photos, without its points. The principal point is the middle of the photo.
 
         - **Record3D**: the `.r3d`, or its folder or an export with `metadata.json`, with the photos called by their
         numbers. The depth maps are not used.

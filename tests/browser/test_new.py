@@ -192,7 +192,7 @@ def test_what_the_job_would_warn_of_is_said_before_the_upload(
     expect(remarks).to_have_text(
         [
             "The cameras are those in scene/.",
-            "Results of an earlier training, not read as photos: preview.jpg.",
+            "Results of an earlier training, not read: preview.jpg.",
             "Not read are raw photos: IMG_1.dng. Develop them as JPEG or TIFF, all with the same settings.",
             *worker,
         ],

@@ -51,6 +51,8 @@ TREES = {
     "cameras that are not read": "images/a.jpg a/scene.SFM scan.nvm b.rd x.mvs temple_par.txt",
     "cameras of other programs": "images/a.jpg images/a.xmp opensfm/Reconstruction.json cameras.XML scan.nvm "
     "bundle.out list.txt bundle.list.txt notes.txt r.csv c.lst",
+    "cameras of trainers": "images/a.jpg cameras.json pose/0.txt other/0.txt a/POSE/1.txt camera/0.json poses.txt",
+    "cameras of a result": "a.jpg splat/cameras.json splat/model.ply",
     "lists without cameras": "a.jpg list.txt c.lst",
     "cameras of other programs without photos": "walk.mp4 cameras.xml scan.nvm",
     "half a model": "images/a.jpg sparse/0/images.txt sparse/0/points3D.txt",

@@ -261,6 +261,37 @@ def visualsfm(folder: Path, viewmats: Sequence[Float], names: Sequence[str], *, 
     return path
 
 
+GAUSSIAN_SPLATTING = 530.0, 534.0
+
+
+def gaussian_splatting_project(points: Float) -> Float:
+    """A pinhole with the principal point in the middle."""
+    plain = points[:, :2] / points[:, 2:]
+    return np.asarray(np.array(SIZE) / 2 + np.array(GAUSSIAN_SPLATTING) * plain)
+
+
+def gaussian_splatting(folder: Path, viewmats: Sequence[Float], names: Sequence[str]) -> Path:
+    """As `camera_to_JSON` of Inria's trainer writes them: for photos of twice the size, without their suffix."""
+    cameras = []
+    for index, (viewmat, name) in enumerate(zip(viewmats, names, strict=True)):
+        to_world = np.linalg.inv(viewmat)
+        cameras.append(
+            {
+                "id": index,
+                "img_name": name.rpartition(".")[0],
+                "width": 2 * SIZE[0],
+                "height": 2 * SIZE[1],
+                "position": to_world[:3, 3].tolist(),
+                "rotation": to_world[:3, :3].tolist(),
+                "fy": 2 * GAUSSIAN_SPLATTING[1],
+                "fx": 2 * GAUSSIAN_SPLATTING[0],
+            }
+        )
+    path = folder / "cameras.json"
+    path.write_text(json.dumps(cameras))
+    return path
+
+
 RECORD3D = 520.0, 524.0, 311.0, 246.5
 
 
@@ -303,4 +334,5 @@ PROGRAMS = {
     "Bundler": Program(bundler, bundler_project),
     "OpenSfM": Program(opensfm, opensfm_project),
     "VisualSFM": Program(visualsfm, visualsfm_project),
+    "3D Gaussian Splatting": Program(gaussian_splatting, gaussian_splatting_project),
 }

@@ -61,7 +61,7 @@ class Found:
     top: the folder of the data set, with a slash at its end, where it is not the given one.
     renamed: relative names of the files that are stored under other names, each with its name in the capture.
     left_out: relative names of the files that no name can be made for, each with the reason.
-    outputs: relative names of pictures, videos and zips that are results of Splatmill.
+    outputs: relative names of pictures, videos, zips and cameras that are results of Splatmill.
     remarks: sentences about files that hold photos or cameras and are not read.
     """
 
@@ -231,9 +231,9 @@ def find_files(path: str | os.PathLike[str]) -> Found:
 
 
 def _results(outputs: Iterable[str]) -> list[str]:
-    """A sentence about results of Splatmill, which are no photos; none where there are none."""
+    """A sentence about results of Splatmill, which are not read; none where there are none."""
     named = sorted(outputs)
-    return [f"Results of an earlier training are not read as photos: {listed(named)}."] if named else []
+    return [f"Results of an earlier training are not read: {listed(named)}."] if named else []
 
 
 def _left_out(unreadable: Mapping[str, str]) -> list[str]:

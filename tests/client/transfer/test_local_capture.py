@@ -288,7 +288,7 @@ def test_a_folder_of_results_alone_is_called_that(tmp_path: Path):
     tree(tmp_path, "model.ply", "report.json", "cameras.json", "preview.jpg")
     with pytest.raises(NothingToUpload, match="no photos") as error:
         find_files(tmp_path)
-    assert "Results of an earlier training are not read as photos: preview.jpg." in str(error.value)
+    assert "Results of an earlier training are not read: cameras.json, preview.jpg." in str(error.value)
 
 
 def test_paths_with_nothing_to_train(tmp_path: Path):

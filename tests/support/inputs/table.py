@@ -127,6 +127,7 @@ PROGRAM_ANSWERS: dict[str, Kind] = {
     "Bundler": "used",
     "OpenSfM": "used with a remark",
     "VisualSFM": "used",
+    "3D Gaussian Splatting": "used",
 }
 
 
@@ -139,6 +140,14 @@ def of_program(program: str, folder: Path) -> None:
 def of_record3d(folder: Path) -> None:
     photos(folder / "rgbd", [f"{k}.jpg" for k in range(COUNT)], SIZE)
     record3d(folder / "metadata.json", [viewmat(k) for k in range(COUNT)], each=True)
+
+
+def nsvf(folder: Path) -> None:
+    plain(folder / "rgb")
+    (folder / "pose").mkdir()
+    (folder / "intrinsics.txt").write_text("60 32 24 0\n")
+    for seed in range(4):
+        (folder / f"pose/{seed}.txt").write_text("1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
 
 
 def r3d(folder: Path) -> None:
@@ -443,5 +452,6 @@ EXAMPLES: tuple[Example, ...] = (
         with_file("reconstruction.json"),
         "used with a remark",
     ),
+    Example("Cameras", "cameras of NSVF", nsvf, "used with a remark"),
     Example("Cameras", "cameras of Meshroom", with_file("scene.sfm"), "used with a remark"),
 )

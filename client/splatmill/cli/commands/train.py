@@ -171,7 +171,7 @@ def _announce(files: Found) -> None:
         typer.echo(f"ignored: {listed([printable(name) for name in files.ignored])}")
     if files.outputs:
         typer.echo(
-            f"results of an earlier training, not read as photos: {listed([printable(name) for name in files.outputs])}"
+            f"results of an earlier training, not read: {listed([printable(name) for name in files.outputs])}"
         )
     for sentence in files.remarks:
         typer.echo(printable(sentence), err=True)

@@ -1,4 +1,4 @@
-"""Which files are results that Splatmill wrote, by their names, so that none is read as a photo."""
+"""Which files are results that Splatmill wrote, by their names, so that none is read as a photo or as cameras."""
 
 from collections import Counter
 from collections.abc import Iterable
@@ -14,12 +14,13 @@ OUTPUT_MEDIA = (
     "orbit.mp4",
     "progress.mp4",
     "cameras.zip",
+    "cameras.json",
 )
-"""Names of pictures, videos and zips that are written to a folder of results."""
+"""Names of files that are written to a folder of results, and that elsewhere hold photos or cameras."""
 
 
 def own_outputs(names: Iterable[str]) -> set[str]:
-    """Return those of the files `names` that are pictures, videos and zips in folders of results."""
+    """Return those of the files `names` that are OUTPUT_MEDIA in folders of results."""
     placed = [(name, *name.rpartition("/")[::2]) for name in names]
     marks = Counter(folder for _, folder, last in placed if last in OUTPUT_MARKS)
     return {name for name, folder, last in placed if last in OUTPUT_MEDIA and marks[folder] >= 2}

@@ -73,7 +73,7 @@ class Accepted(Response):
         description="Names of files of which a folder with results of Splatmill holds two at least.",
     )
     output_media: list[str] = Field(
-        default_factory=list, description="Names of files in such a folder that are not read as photos."
+        default_factory=list, description="Names of files in such a folder that are not read."
     )
     unread: list[Unread] = Field(default_factory=list, description="Kinds of files that are not read.")
     program_files: list[str] = Field(

@@ -1,6 +1,6 @@
-"""Proves that cameras in files of Metashape, RealityScan, Bundler, OpenSfM, VisualSFM and Record3D become those of the
-same capture in the form of COLMAP: poses to 1e-6, and pixels, by the formulas of these programs, to 0.01. Wrong files
-are refused.
+"""Proves that cameras in files of Metashape, RealityScan, Bundler, OpenSfM, VisualSFM, 3D Gaussian Splatting and
+Record3D become those of the same capture in the form of COLMAP: poses to 1e-6, and pixels, by the formulas of these
+programs, to 0.01. Wrong files are refused.
 
 Not proven here: that a release of such a program writes what its manual says.
 """
@@ -113,7 +113,7 @@ def test_a_file_that_is_cut_off_is_named(tmp_path: Path, program: str, share: fl
 MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
 
 
-@pytest.mark.parametrize("program", ["Metashape", "RealityScan, XMP", "Bundler"])
+@pytest.mark.parametrize("program", ["Metashape", "RealityScan, XMP", "Bundler", "3D Gaussian Splatting"])
 def test_mirrored_axes_are_refused_and_one_of_many_is_left_out(tmp_path: Path, program: str) -> None:
     photos(tmp_path / "images", size=SIZE)
     PROGRAMS[program].write(tmp_path, [MIRROR @ each for each in VIEWMATS], NAMES)
@@ -264,6 +264,7 @@ STRAY = {
     "reconstruction.json": b"{}",
     "wordlist.txt": b"a",
     "a.nvm": b"x",
+    "cameras.json": b'{"cameras": [{"name": "a.jpg"}]}',
     "metadata.json": b'{"title": "an album"}',
 }
 
@@ -278,7 +279,8 @@ def test_files_with_such_names_and_other_contents_are_no_cameras(tmp_path: Path)
         (tmp_path / name).rename(tmp_path / "poses" / name)
     (said,) = posed.without_cameras(tmp_path)
     assert said.startswith(
-        "No cameras of a program that is known (Metashape, RealityScan, OpenSfM, Bundler, VisualSFM, Record3D) are in"
+        "No cameras of a program that is known (Metashape, RealityScan, OpenSfM, Bundler, VisualSFM, "
+        "3D Gaussian Splatting, Record3D) are in"
     )
 
 
@@ -292,6 +294,15 @@ UNREAD = [
     "00000001_cam.txt",
     "scan_calibrated_external_camera_parameters.txt",
     "cameras_sphere.npz",
+    "intrinsics.txt",
+    "pose/000.txt",
+    "camera/000.json",
+    "lowres_wide.traj",
+    "frame_00000.json",
+    "Barn_COLMAP_SfM.log",
+    "poses.txt",
+    "a.psz",
+    "a.p4d",
 ]
 
 
@@ -299,6 +310,7 @@ UNREAD = [
 def test_cameras_that_are_not_read_are_sent_so_that_the_job_names_them(tmp_path: Path, name: str) -> None:
     given, stored = tmp_path / "given", tmp_path / "capture"
     photos(given / "images")
+    (given / name).parent.mkdir(exist_ok=True)
     (given / name).write_bytes(b"x")
     found = find_files(given)
     assert any(name in remark and "are not read" in remark for remark in found.remarks)

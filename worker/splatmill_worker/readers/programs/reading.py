@@ -10,6 +10,7 @@ from typing import Any
 from splatmill.data_sets import fits
 from splatmill_worker.readers.programs import (
     bundler,
+    gaussian_splatting,
     metashape,
     opensfm,
     realityscan,
@@ -53,6 +54,12 @@ KINDS = (
     Kind("OpenSfM", ("reconstruction.json",), ('"cameras"',), opensfm.read),
     Kind("Bundler", ("*.out",), ("# bundle file",), bundler.read),
     Kind("VisualSFM", ("*.nvm",), ("nvm_v3",), visualsfm.read),
+    Kind(
+        "3D Gaussian Splatting",
+        ("cameras.json",),
+        ('"img_name"', '"position"', '"rotation"'),
+        gaussian_splatting.read,
+    ),
     Kind("Record3D", ("metadata.json", "metadata"), ('"poses"', '"k"'), record3d.read),
 )
 """In order of preference, where a data set has cameras of several."""

@@ -36,7 +36,7 @@ import { hasPhotosBeside, named } from "./documents.js";
  * @property {string | null} problem why the files cannot be read as one capture
  * @property {Set<string>} named paths of masks that frames of transforms files name
  * @property {Map<string, string>} others paths of pictures that are no photos, with what they are
- * @property {string[]} outputs paths of pictures, videos and zips that are results of Splatmill
+ * @property {string[]} outputs paths of pictures, videos, zips and cameras that are results of Splatmill
  * @property {string} top folder of the data set, with a slash at its end, where it is not the given one
  * @property {boolean} posed whether there are cameras that may be read
  * @property {string[]} idle files that may have cameras of other programs, where there are no photos for them
@@ -169,7 +169,7 @@ function besidePhotos(paths, accepted) {
 }
 
 /**
- * The pictures, videos and zips in folders of results.
+ * The pictures, videos, zips and cameras in folders of results.
  * @param {string[]} paths
  * @param {Accepted} accepted
  */
@@ -303,9 +303,9 @@ function programFiles(paths, accepted) {
   return paths.filter((path) => patterns.some((pattern) => fits(path, pattern)));
 }
 
-/** Whether the last part of a path fits a pattern in lower case, in which * stands for any letters. @param {string} path @param {string} pattern */
+/** Whether the last parts of a path, as many as a pattern in lower case has, fit it; * stands for any letters. @param {string} path @param {string} pattern */
 export function fits(path, pattern) {
-  const name = path.slice(path.lastIndexOf("/") + 1).toLowerCase();
+  const name = path.split("/").slice(-pattern.split("/").length).join("/").toLowerCase();
   const parts = pattern.split("*").map((part) => part.replace(/[.*+?^${}()|[\]\\]/g, "\\$&"));
   return new RegExp(`^${parts.join(".*")}$`, "su").test(name);
 }

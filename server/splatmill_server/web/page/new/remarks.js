@@ -61,7 +61,7 @@ function unreadCameras(paths, accepted) {
 export function places({ top, outputs }) {
   return [
     ...(top ? [`The cameras are those in ${top}.`] : []),
-    ...(outputs.length ? [`Results of an earlier training, not read as photos: ${outputs.join(", ")}.`] : []),
+    ...(outputs.length ? [`Results of an earlier training, not read: ${outputs.join(", ")}.`] : []),
   ];
 }
 
