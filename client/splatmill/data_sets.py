@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
 
+from splatmill.schema.files.photos import ARCHIVE_SUFFIXES, PHOTO_SUFFIXES, VIDEO_SUFFIXES
+
 MAX_DEPTH = 4
 """Folders around a data set that are looked into: zips and programs often put it into folders of their own."""
 
@@ -225,6 +227,33 @@ def named_by_job(names: Sequence[str]) -> list[str]:
     """Those of some names whose files have cameras that are not read, and are sent so that the job says so."""
     patterns = [each for one in OTHER_CAMERAS.values() for each in one if each not in LARGE]
     return [name for name in names if fits(name, patterns)]
+
+
+def camera_files(names: Sequence[str]) -> list[str]:
+    """Those of some names whose files may have cameras, those that are not read included."""
+    patterns = (*MODEL_PARTS, TRANSFORMS, *(each for one in OTHER_CAMERAS.values() for each in one))
+    programs = program_files(names)
+    return [
+        name
+        for name in names
+        if name in programs
+        or fits(name, patterns)
+        or (name.lower().endswith(".json") and keyframes(_split(name)[0]) is not None)
+    ]
+
+
+def holds_media(names: Sequence[str]) -> bool:
+    """Whether some of these names are those of photos, videos or archives."""
+    return any(name.lower().endswith((*PHOTO_SUFFIXES, *VIDEO_SUFFIXES, *ARCHIVE_SUFFIXES)) for name in names)
+
+
+def not_used_in_zip(archive: str, first: str, *, posed: bool) -> str:
+    """A sentence about cameras in a zip that lies among photos. posed: whether these have cameras beside them."""
+    why = "other cameras lie beside the photos" if posed else "photos lie in the zip and beside it"
+    return (
+        f"The cameras in {archive} are not used, such as {first}: {why}. Give one folder or one zip with the photos "
+        "and the cameras that belong to them."
+    )
 
 
 def fits(name: str, patterns: Sequence[str]) -> bool:

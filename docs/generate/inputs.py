@@ -117,7 +117,9 @@ def _photos() -> list[str]:
         refused, since they may be linear light as well. The report says what was converted or assumed.""",
         "### Zips\n",
         f"""{choices(ARCHIVE_SUFFIXES)} files hold photos or a whole data set. All zips and videos of a capture together
-        hold up to {archive.MAX_ENTRIES:,} files. A zip in a zip is not unpacked.
+        hold up to {archive.MAX_ENTRIES:,} files. A zip in a zip is not unpacked. A zip among photos without cameras
+        that holds cameras and no photos gives them theirs; where it has photos too, or other cameras lie beside the
+        photos, a sentence names its cameras.
 
         Names that do not say that they are UTF-8, and are not, are read in the encoding that makes them those which the
         cameras name. Without cameras, it is the first one in which they are words of its language; a warning then has

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import re
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -53,6 +54,10 @@ TREES = {
     "bundle.out list.txt bundle.list.txt notes.txt r.csv c.lst",
     "cameras of trainers": "images/a.jpg cameras.json pose/0.txt other/0.txt a/POSE/1.txt camera/0.json poses.txt",
     "cameras of a result": "a.jpg splat/cameras.json splat/model.ply",
+    "cameras in a zip": "a.jpg cams.zip:scene.nvm,__MACOSX/a.nvm old.zip:notes.txt",
+    "cameras in zips with photos or beside others": "a.jpg b.r3d:metadata,rgbd/0.jpg c.zip:Keyframes/cameras/1.json "
+    "transforms.json",
+    "a zip of cameras that are not read": "x/a.jpg x/cams.zip:set/pose/1.txt,set/readme.md",
     "lists without cameras": "a.jpg list.txt c.lst",
     "cameras of other programs without photos": "walk.mp4 cameras.xml scan.nvm",
     "half a model": "images/a.jpg sparse/0/images.txt sparse/0/points3D.txt",
@@ -101,26 +106,35 @@ TREES |= {
 
 def test_files_are_sorted_as_by_the_command_line(page: Page, tmp_path: Path) -> None:
     opened(page)
-    script = """async ([paths, texts]) => {
+    script = """async ([paths, texts, zipped]) => {
       const { documentsIn } = await import("/page/any/new/documents.js");
       const { sort } = await import("/page/any/new/kinds.js");
       const { remarks } = await import("/page/any/new/remarks.js");
+      const { listsIn } = await import("/page/any/new/zip.js");
       const { accepted } = await (await fetch("/v1/info")).json();
       const file = (path, bytes) => new File([new Uint8Array(bytes)], path);
       const given = Object.entries(texts).map(([path, bytes]) => ({ path, file: file(path, bytes) }));
-      const sorted = sort(paths, accepted, await documentsIn(given));
+      const zips = Object.entries(zipped).map(([path, bytes]) => ({ path, file: file(path, bytes) }));
+      const sorted = sort(paths, accepted, await documentsIn(given), await listsIn(zips, accepted.archives));
       return { ...sorted, others: [], remarks: remarks(sorted, accepted) };
     }"""
     for title, names in TREES.items():
         root = tmp_path / title
         encoding = title.rpartition(" in ")[2] if title.startswith("names") else "utf-8"
         content = TRANSFORMS.get(title, "x").encode(encoding)
-        paths = [name.replace("\0", " ") for name in names.split()]
-        for name in paths:
+        # What follows a colon is in the zip of that name.
+        trees = dict(name.replace("\0", " ").partition(":")[::2] for name in names.split())
+        paths = list(trees)
+        for name, inside in trees.items():
             (root / name).parent.mkdir(parents=True, exist_ok=True)
             (root / name).write_bytes(content)
+            if inside:
+                with zipfile.ZipFile(root / name, "w") as archive:
+                    for each in inside.split(","):
+                        archive.writestr(each, "x")
+        zipped = {name: list((root / name).read_bytes()) for name, inside in trees.items() if inside}
         texts = {name: list(content) for name in paths if title in TRANSFORMS and "json" in name}
-        here = page.evaluate(script, [paths, texts])
+        here = page.evaluate(script, [paths, texts, zipped])
         if here["problem"] is not None:
             with pytest.raises(NothingToUpload, match=re.escape(here["problem"])):
                 find_files(root)

@@ -82,11 +82,11 @@ def check(scene: Scene, expected: dict[str, int]) -> None:
 ALL = {name: k for k, name in enumerate(NAMES)}
 
 
-def zip_of(folder: Path, target: Path, slash: str = "/") -> None:
+def zip_of(folder: Path, target: Path, slash: str = "/", only: str = "*") -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     with zipfile.ZipFile(target, "w") as archive:
-        for path in sorted(folder.rglob("*")):
-            if path.is_file():
+        for path in sorted(folder.rglob(only)):
+            if path.is_file() and path != target:
                 entry = zipfile.ZipInfo("x")
                 entry.filename = path.relative_to(folder).as_posix().replace("/", slash)
                 archive.writestr(entry, path.read_bytes())

@@ -3,6 +3,7 @@
 import json
 import os
 import unicodedata
+import zipfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,9 +12,12 @@ from typing import Any
 from splatmill.data_sets import (
     Cameras,
     TwoDataSets,
+    camera_files,
     find_cameras,
+    holds_media,
     is_camera_file,
     named_by_job,
+    not_used_in_zip,
     place_of_model,
     unread_cameras,
     unreadable_file,
@@ -128,9 +132,10 @@ def find_files(path: str | os.PathLike[str]) -> Found:
     its name in `transforms_train.json`. Masks lie in a folder such as `masks/`, beside their photos
     (`splatmill.schema.files.masks`), or where frames name them; poses are `transforms*.json`, the `.ply` files of
     points that they name, and COLMAP models. All of this may lie some folders down: see `data_sets.find_cameras`.
-    Hidden files and folders are ignored. Videos and zip archives are used only where there are no photos. Pictures in
-    a folder of results are no photos (`splatmill.schema.files.outputs`), and neither are those in a folder of depth
-    maps, for example, if no cameras are given (`splatmill.schema.files.other_pictures`).
+    Hidden files and folders are ignored. Videos and zip archives are used only where there are no photos; a zip of
+    cameras alone goes along with photos that have none. Pictures in a folder of results are no photos
+    (`splatmill.schema.files.outputs`), and neither are those in a folder of depth maps, for example, if no cameras are
+    given (`splatmill.schema.files.other_pictures`).
 
     A file whose name the service does not accept gets another one, or is left out. What is no regular file, or cannot
     be read, is left out too (`data_sets.walk`).
@@ -148,14 +153,14 @@ def find_files(path: str | os.PathLike[str]) -> Found:
     unreadable: dict[str, str] = {}
     try:
         names = walk(root, unreadable)
+        outputs = own_outputs(names)
+        names = [name for name in names if name not in outputs]
         cameras = find_cameras(names) or Cameras("")
     except OSError as error:
         raise NothingToUpload(f"{error.filename} cannot be read: {error.strerror}.") from error
     except TwoDataSets as error:
         raise NothingToUpload(f"{root} cannot be read as one capture. {error}") from error
 
-    outputs = own_outputs(names)
-    names = [name for name in names if name not in outputs]
     # Cameras in a folder without photos are those of the photos around it.
     top = cameras.top if any(name.startswith(cameras.top) and _is_image(name) for name in names) else ""
     photo_root = f"{top}images/"
@@ -178,6 +183,8 @@ def find_files(path: str | os.PathLike[str]) -> Found:
         if said:
             raise NothingToUpload(said)
         others = beside_photos(inside)
+    zipped = _cameras_in_zips(root, names) if pictures else {}
+    along = set() if poses else {name for name, (_, has_photos) in zipped.items() if not has_photos}
     points = _named(documents, "ply_file_path", cameras.top).intersection(names)
     poses |= {name: name.removeprefix(cameras.top) for name in points if _suffix(name) == ".ply"}
     posed = bool(poses or (pictures and cameras.programs))
@@ -194,6 +201,8 @@ def find_files(path: str | os.PathLike[str]) -> Found:
                 files.append(_local(Role.masks, masks[name], root / name))
             elif name.startswith(photo_root) and _is_image(name) and name not in others:
                 files.append(_local(Role.images, name.removeprefix(photo_root), root / name))
+            elif name in along:
+                files.append(_local(Role.images, name, root / name))
             else:
                 ignored.append(name)
         except NothingToUpload as error:  # it was deleted since it was listed
@@ -226,8 +235,37 @@ def find_files(path: str | os.PathLike[str]) -> Found:
         )
     if beside:
         remarks.append(f"Videos and zips are not used where there are photos: {listed(beside)}.")
+    remarks += [
+        not_used_in_zip(name, first, posed=not has_photos)
+        for name, (first, has_photos) in zipped.items()
+        if name not in along
+    ]
     remarks += other_remarks(others) + _cameras_beside(root, cameras)
     return replace(capture_files, top=cameras.top, outputs=tuple(sorted(outputs)), remarks=tuple(remarks))
+
+
+def _cameras_in_zips(root: Path, names: Iterable[str]) -> dict[str, tuple[str, bool]]:
+    """For each zip with files of cameras, the first of these, and whether the zip has photos or videos too.
+
+    A zip whose list of files cannot be read is left out: it is named with those that are not used.
+    """
+    found: dict[str, tuple[str, bool]] = {}
+    for name in names:
+        if _suffix(name) not in ARCHIVE_SUFFIXES:
+            continue
+        try:
+            with zipfile.ZipFile(root / name) as archive:
+                entries = [each.replace("\\", "/") for each in archive.namelist()]
+        except (OSError, ValueError, NotImplementedError, zipfile.BadZipFile):
+            continue
+        inside = sorted(each for each in entries if not each.endswith("/") and not _is_hidden(each))
+        if cameras := camera_files(inside):
+            found[name] = cameras[0], holds_media(inside)
+    return found
+
+
+def _is_hidden(name: str) -> bool:
+    return any(part.startswith((".", "__MACOSX")) for part in name.split("/"))
 
 
 def _results(outputs: Iterable[str]) -> list[str]:

@@ -83,12 +83,12 @@ def answer(make: Callable[[Path], object]) -> Answer:
 def _read(capture: Path, work: Path) -> tuple[int, str, int, list[str]]:
     """Photos, source of the cameras, masks, and sentences: warnings, and why files are left out."""
     capture = zipped.data_set(capture, work)
-    given = posed.find(capture)
+    given = posed.find(capture) or zipped.cameras_beside(capture, work)
     if given is not None:
         scene: Scene = given.load()
         masks = sum(view.mask is not None for view in scene.views)
         return len(scene.views), scene.source, masks, [*scene.warnings, *omissions(scene.left_out)]
     prepared = prepare(capture / Role.images, mask_folder(capture), work)
     masks = sum(photo.mask is not None for photo in prepared.photos)
-    unread = posed.without_cameras(capture)
+    unread = [*posed.without_cameras(capture), *zipped.unused_cameras(capture, work)]
     return len(prepared.photos), "sfm", masks, [*unread, *prepared.warnings, *omissions(prepared.skipped)]

@@ -150,6 +150,18 @@ def nsvf(folder: Path) -> None:
         (folder / f"pose/{seed}.txt").write_text("1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
 
 
+def zipped_cameras(folder: Path) -> None:
+    of_program("VisualSFM", folder)
+    zip_of(folder, folder / "cams.zip", only="*.nvm")
+    (folder / "scene.nvm").unlink()
+
+
+def zipped_with_photos(folder: Path) -> None:
+    of_program("VisualSFM", folder.parent / "made")
+    zip_of(folder.parent / "made", folder / "set.zip")
+    plain(folder)
+
+
 def r3d(folder: Path) -> None:
     with tempfile.TemporaryDirectory() as name:
         of_record3d(Path(name))
@@ -451,6 +463,10 @@ EXAMPLES: tuple[Example, ...] = (
         "a reconstruction.json without cameras",
         with_file("reconstruction.json"),
         "used with a remark",
+    ),
+    Example("Cameras", "cameras of VisualSFM in a zip beside the photos", zipped_cameras, "used"),
+    Example(
+        "Cameras", "a zip of photos and such cameras beside photos", zipped_with_photos, "used with a remark"
     ),
     Example("Cameras", "cameras of NSVF", nsvf, "used with a remark"),
     Example("Cameras", "cameras of Meshroom", with_file("scene.sfm"), "used with a remark"),

@@ -52,7 +52,7 @@ def posed_scene(
     points = given_points.points_path(capture, options)
     capture = zipped.data_set(capture, workdir, cancelled)
     try:
-        given = posed.find(capture)
+        given = posed.find(capture) or zipped.cameras_beside(capture, workdir, cancelled)
     except (TwoDataSets, posed.TwoFiles) as error:
         raise Refusal(
             "poses_invalid", str(error), advice="Give one data set, or photos without cameras."
@@ -113,7 +113,7 @@ def posed_scene(
         observer,
         None if options.scale is None else known_distance(options.scale),
     )
-    unread = posed.without_cameras(capture)
+    unread = [*posed.without_cameras(capture), *zipped.unused_cameras(capture, workdir, cancelled)]
     return replace(
         scene, warnings=(*names_remark(capture), *unread, *scene.warnings, *one_place.warning(scene))
     )

@@ -1,4 +1,5 @@
-"""A data set in one zip gives the scene that its folder gives: cameras, photos and masks in their roles.
+"""A data set in one zip gives the scene that its folder gives: cameras, photos and masks in their roles. Cameras in a
+zip among loose photos are found, or named.
 
 Does not prove that unpacking is safe (tests/worker/images does), nor how each layout is read (test_posed.py).
 """
@@ -6,6 +7,7 @@ Does not prove that unpacking is safe (tests/worker/images does), nor how each l
 import json
 import shutil
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,11 +15,15 @@ import pytest
 from PIL import Image
 
 from splatmill.schema import TrainOptions
+from splatmill.transfer.local_capture import find_files
 from splatmill_worker.errors import Refusal
 from splatmill_worker.images.archives.archive import Allowance
 from splatmill_worker.pipeline.capture import posed_scene
+from splatmill_worker.sfm import posed
 from splatmill_worker.sfm.posed import zipped
-from tests.support import still_life
+from tests.support import posed_sets, still_life
+from tests.support.posed_sets import NAMES
+from tests.support.program_files import PROGRAMS, SIZE
 
 
 @pytest.fixture
@@ -114,3 +120,88 @@ def test_a_zip_that_unpacks_to_too_much_is_refused(
     with pytest.raises(Refusal) as refused:
         zipped.data_set(tmp_path / "capture", tmp_path / "work")
     assert refused.value.code == "archive_bomb"
+
+
+def stored(given: Path, capture: Path) -> Path:
+    """The capture that the command line makes of a folder."""
+    for file in find_files(given).files:
+        target = capture / file.role / file.name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(file.path.read_bytes())
+    return capture
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+@pytest.mark.parametrize("sent", [True, False])
+def test_cameras_in_a_zip_among_loose_photos_are_found(tmp_path: Path, program: str, sent: bool) -> None:
+    """Of a folder by the command line, and of a capture in which photos and zip lie side by side."""
+    given = tmp_path / "given/images"
+    posed_sets.photos(given, size=SIZE)
+    cameras = tmp_path / "cameras"
+    (cameras / "scan").mkdir(parents=True)
+    PROGRAMS[program].write(cameras / "scan", [posed_sets.viewmat(k) for k in range(posed_sets.COUNT)], NAMES)
+    zip_of(cameras, given / "cams.zip")
+    capture = stored(given, tmp_path / "capture") if sent else tmp_path / "given"
+    found = zipped.cameras_beside(capture, tmp_path / "work")
+    assert found is not None
+    scene = found.load()
+    for view in scene.views:
+        expected = posed_sets.viewmat(posed_sets.ALL[view.name])
+        np.testing.assert_allclose(view.camera.viewmat, expected, atol=1e-6)
+    assert (len(scene.views), scene.left_out) == (posed_sets.COUNT, ())
+    assert "The cameras are those in cams.zip." in scene.notes
+    assert not any("zip" in warning for warning in scene.warnings)
+
+
+@pytest.mark.parametrize(
+    "write", [posed_sets.model, lambda folder: posed_sets.transforms(folder / "transforms.json")]
+)
+def test_models_and_transforms_in_such_a_zip_are_found(
+    tmp_path: Path, write: Callable[[Path], object]
+) -> None:
+    given = tmp_path / "given"
+    posed_sets.photos(given)
+    write(tmp_path / "cameras/a/0")
+    zip_of(tmp_path / "cameras", given / "cams.zip")
+    found = zipped.cameras_beside(stored(given, tmp_path / "capture"), tmp_path / "work")
+    assert found is not None
+    posed_sets.check(found.load(), posed_sets.ALL)
+
+
+def test_cameras_in_a_zip_with_photos_are_named(tmp_path: Path) -> None:
+    images, inner = tmp_path / "capture/images", tmp_path / "inner"
+    posed_sets.photos(images, size=SIZE)
+    posed_sets.photos(inner, size=SIZE)
+    PROGRAMS["VisualSFM"].write(inner, [posed_sets.viewmat(k) for k in range(posed_sets.COUNT)], NAMES)
+    zip_of(inner, images / "set.zip")
+    assert zipped.cameras_beside(tmp_path / "capture", tmp_path / "work") is None
+    (said,) = zipped.unused_cameras(tmp_path / "capture", tmp_path / "work")
+    assert said.startswith(
+        "The cameras in set.zip are not used, such as scene.nvm: photos lie in the zip and"
+    )
+    assert said in find_files(images).remarks
+
+
+def test_a_zip_beside_photos_with_cameras_is_named(tmp_path: Path) -> None:
+    capture = tmp_path / "capture"
+    posed_sets.photos(capture / "images")
+    posed_sets.transforms(capture / "poses/transforms.json")
+    posed_sets.model(tmp_path / "other/sparse/0")
+    zip_of(tmp_path / "other", capture / "images/cams.zip")
+    scene = posed_sets.loaded(capture)
+    assert scene.warnings == ("Videos and zips are not used where photos have cameras: cams.zip.",)
+    (capture / "poses/transforms.json").rename(capture / "images/transforms.json")
+    remarks = find_files(capture / "images").remarks
+    assert any(
+        "The cameras in cams.zip are not used, such as sparse/0/cameras.txt: other cameras" in text
+        for text in remarks
+    )
+
+
+def test_two_zips_of_cameras_are_refused(tmp_path: Path) -> None:
+    posed_sets.photos(tmp_path / "capture/images")
+    posed_sets.model(tmp_path / "other/sparse/0")
+    for name in ("a.zip", "b.zip"):
+        zip_of(tmp_path / "other", tmp_path / "capture/images" / name)
+    with pytest.raises(posed.TwoFiles, match=r"Cameras are in a.zip and in b.zip"):
+        zipped.cameras_beside(tmp_path / "capture", tmp_path / "work")

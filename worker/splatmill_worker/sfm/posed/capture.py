@@ -18,7 +18,8 @@ from splatmill.data_sets import (
     unread_cameras,
     walk,
 )
-from splatmill.schema.files.photos import PHOTO_SUFFIXES
+from splatmill.schema.files.outputs import own_outputs
+from splatmill.schema.files.photos import ARCHIVE_SUFFIXES, PHOTO_SUFFIXES, VIDEO_SUFFIXES
 from splatmill.schema.quantities import listed
 from splatmill_worker.errors import UnusablePicture
 from splatmill_worker.images import lens, mask_levels, transparency
@@ -50,6 +51,8 @@ class PosedInput:
     notes: sentences for the user about files that are not used.
     warnings: sentences for the user about photos that are not used.
     program: the cameras of another program; None for the other kinds.
+    archive, unpacked: name of the zip among the photos that has the cameras, and the folder with its content; None
+        where they are in no such zip.
     """
 
     directory: Path
@@ -59,6 +62,8 @@ class PosedInput:
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     program: ProgramCameras | None = None
+    archive: str | None = None
+    unpacked: Path | None = None
 
     def load(self) -> Scene:
         """The scene with the cameras as they were given.
@@ -73,7 +78,8 @@ class PosedInput:
         elif self.program is not None:
             scene = programs.load(self.program, files, self.notes)
         else:
-            scene = transforms.load(self.transforms, self.source, files, self.directory, self.notes)
+            around = self.directory if self.unpacked is None else self.unpacked
+            scene = transforms.load(self.transforms, self.source, files, around, self.notes)
         scene = without_contradicted(_decoded(_without_unfit_masks(scene)))
         masks = [view.mask for view in scene.views if view.mask is not None]
         unused = {name for name in files.unused_masks if files.masks[name] not in masks}
@@ -81,7 +87,11 @@ class PosedInput:
         scene = replace(
             scene, views=tuple(replace(view, shown_from=judged.shown_from) for view in scene.views)
         )
-        warnings = [*judged.warnings, *lens.remarks(view.lens for view in scene.views)]
+        warnings = [
+            *judged.warnings,
+            *lens.remarks(view.lens for view in scene.views),
+            *self._media_beside(files),
+        ]
         colors = [photo_colors(view.image, view.name) for view in scene.views]
         return replace(
             scene,
@@ -89,22 +99,38 @@ class PosedInput:
             warnings=(*self.warnings, *scene.warnings, *sentences(colors), *warnings),
         )
 
+    def _media_beside(self, files: ImageFiles) -> list[str]:
+        """A sentence about videos and zips among the photos; none without them."""
+        inside = walk(files.root)
+        results = own_outputs(inside)
+        names = [
+            name
+            for name in inside
+            if Path(name).suffix.lower() in VIDEO_SUFFIXES + ARCHIVE_SUFFIXES
+            and name != self.archive
+            and name not in results
+        ]
+        return [f"Videos and zips are not used where photos have cameras: {listed(names)}."] if names else []
 
-def find(directory: Path) -> PosedInput | None:
+
+def find(directory: Path, beside: Path | None = None) -> PosedInput | None:
     """The cameras in `directory`, in poses/ first; None when there are none.
+
+    beside: another folder in which the cameras of the photos in `directory` are looked for instead.
 
     A COLMAP model is preferred to transforms.json, because it has sparse points as well. The cameras may lie some
     folders down: see `splatmill.data_sets.find_cameras`. Those of other programs are used where there are neither.
 
     Raises TwoDataSets, and TwoFiles.
     """
-    for base in (directory / folder for folder in POSE_FOLDERS):
+    bases = [directory / folder for folder in POSE_FOLDERS] if beside is None else [beside]
+    for base in bases:
         names = walk(base) if base.is_dir() else []
         cameras = find_cameras(names)
         if cameras is None:
             continue
         place, notes = directory, []
-        warnings = tuple(names_remark(directory))
+        warnings = tuple(names_remark(directory if beside is None else beside))
         program = programs.find(base, cameras.programs)
         if not cameras.models and not cameras.transforms:
             if program is None:

@@ -45,6 +45,8 @@ export class Items {
     this.byPath = new Map();
     /** @type {import("./documents.js").Documents} */
     this.documents = new Map();
+    /** @type {Map<string, string[]>} names of the files in each zip, by its path */
+    this.lists = new Map();
     this.count = 0;
     /** @type {string | null} why the files cannot be one capture */
     this.problem = null;
@@ -74,9 +76,11 @@ export class Items {
    * a path of its own, because phones call each photo image.jpg.
    * @param {import("./given.js").Given[]} given
    * @param {import("./documents.js").Documents} documents the transforms files among them
+   * @param {Map<string, string[]>} lists names of the files in each zip among them, by its path
    */
-  add(given, documents) {
+  add(given, documents, lists) {
     for (const [path, document] of documents) this.documents.set(path, document);
+    for (const [path, inside] of lists) this.lists.set(path, inside);
     const added = [];
     for (const { path, file } of given) {
       const free = this.free(path, file);
@@ -109,11 +113,12 @@ export class Items {
     for (const item of this.all) if (item.thumbnail) URL.revokeObjectURL(item.thumbnail);
     this.byPath.clear();
     this.documents.clear();
+    this.lists.clear();
   }
 
   /** Decide again what each file is; more files may change that. */
   sort() {
-    const sorted = sort(this.byPath.keys(), this.accepted, this.documents);
+    const sorted = sort(this.byPath.keys(), this.accepted, this.documents, this.lists);
     this.problem = sorted.problem;
     for (const item of this.all) item.named = sorted.named.has(item.path);
     this.said = [...places(sorted), ...remarks(sorted, this.accepted)];

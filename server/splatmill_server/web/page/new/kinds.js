@@ -39,6 +39,8 @@ import { hasPhotosBeside, named } from "./documents.js";
  * @property {string[]} outputs paths of pictures, videos, zips and cameras that are results of Splatmill
  * @property {string} top folder of the data set, with a slash at its end, where it is not the given one
  * @property {boolean} posed whether there are cameras that may be read
+ * @property {{path: string, first: string, posed: boolean}[]} zipped zips with files of cameras that are not used: the first
+ *   of these, and whether it is because other cameras are
  * @property {string[]} idle files that may have cameras of other programs, where there are no photos for them
  */
 
@@ -52,6 +54,9 @@ const MODEL_PLACES = /** @type {[number, RegExp][]} */ ([
 
 /** Folders in which the raw data of Polycam have a .json file for each photo, the preferred one first. */
 const KEYFRAMES = ["keyframes/corrected_cameras/", "keyframes/cameras/"];
+
+/** Names, in lower case, of the files that a COLMAP model must have. */
+export const MODEL_PARTS = ["cameras.bin", "cameras.txt", "images.bin", "images.txt"];
 
 /** Folders around a data set that are looked into. */
 export const MAX_DEPTH = 4;
@@ -74,9 +79,10 @@ export function suffix(path) {
  * @param {Iterable<string>} paths
  * @param {Accepted} accepted
  * @param {import("./documents.js").Documents} documents those of the transforms files that can be read
+ * @param {Map<string, string[]>} lists names of the files in each zip, by its path
  * @returns {Sorted}
  */
-export function sort(paths, accepted, documents = new Map()) {
+export function sort(paths, accepted, documents = new Map(), lists = new Map()) {
   const shown = [...paths].filter((path) => !isHidden(path)).sort(byCodePoint);
   const outputs = ownOutputs(shown, accepted);
   const visible = shown.filter((path) => !outputs.has(path));
@@ -103,8 +109,10 @@ export function sort(paths, accepted, documents = new Map()) {
   const unread = visible.filter((path) => Object.values(accepted.other_cameras).flat().some((pattern) => fits(path, pattern)));
   const small = unread.filter((path) => !accepted.large_cameras.some((pattern) => fits(path, pattern)));
   if (pictures.length) for (const path of [...programs, ...small]) if (!poses.has(path)) poses.set(path, path);
+  const zips = pictures.length ? camerasInZips(visible, lists, accepted) : [];
+  const along = new Set(alone ? zips.filter(({ posed }) => posed).map(({ path }) => path) : []);
   /** @type {Sorted} */
-  const sorted = { files: [], ignored: [], problem: cameras.problem, named: new Set([...drawn].filter((path) => masks.has(path))), others: new Map(), outputs: [], top: cameras.top, posed: !alone || (pictures.length > 0 && programs.length > 0), idle: pictures.length ? [] : programs };
+  const sorted = { files: [], ignored: [], problem: cameras.problem, named: new Set([...drawn].filter((path) => masks.has(path))), others: new Map(), outputs: [], top: cameras.top, zipped: zips.filter(({ path }) => !along.has(path)), posed: !alone || (pictures.length > 0 && programs.length > 0), idle: pictures.length ? [] : programs };
   if (alone) {
     const inside = visible.filter((path) => path.startsWith(photoRoot) && isPhoto(path));
     sorted.problem ??= noPhotos(inside, accepted);
@@ -117,7 +125,8 @@ export function sort(paths, accepted, documents = new Map()) {
     else if (mask !== undefined) sorted.files.push({ role: "masks", name: mask, path });
     else if (path.startsWith(photoRoot) && isPhoto(path) && !sorted.others.has(path)) {
       sorted.files.push({ role: "images", name: path.slice(photoRoot.length), path });
-    } else sorted.ignored.push(path);
+    } else if (along.has(path)) sorted.files.push({ role: "images", name: path, path });
+    else sorted.ignored.push(path);
   }
   if (!sorted.files.some((file) => file.role === "images")) {
     sorted.files.push(...sorted.ignored.filter(isWhole).map((path) => /** @type {const} */ ({ role: "images", name: path, path })));
@@ -301,6 +310,29 @@ function namesOf(cameras, paths) {
 function programFiles(paths, accepted) {
   const patterns = [...accepted.program_files, ...(paths.some((path) => fits(path, "*.out")) ? accepted.camera_lists : [])];
   return paths.filter((path) => patterns.some((pattern) => fits(path, pattern)));
+}
+
+/**
+ * The zips with files of cameras: the first of these, and whether nothing but other cameras keeps them from being used.
+ * @param {string[]} paths
+ * @param {Map<string, string[]>} lists
+ * @param {Accepted} accepted
+ */
+function camerasInZips(paths, lists, accepted) {
+  const patterns = [...MODEL_PARTS, "transforms*.json", ...Object.values(accepted.other_cameras).flat()];
+  const media = [...accepted.photos, ...accepted.videos, ...accepted.archives];
+  return paths.flatMap((path) => {
+    const inside = (lists.get(path) ?? []).filter((name) => !isHidden(name)).sort(byCodePoint);
+    const programs = programFiles(inside, accepted);
+    const first = inside.find((name) => programs.includes(name) || patterns.some((pattern) => fits(name, pattern)) || isKeyframe(name));
+    return first ? [{ path, first, posed: !inside.some((name) => media.some((ending) => name.toLowerCase().endsWith(ending))) }] : [];
+  });
+}
+
+/** Whether a path is that of a camera in the raw data of Polycam. @param {string} path */
+function isKeyframe(path) {
+  const folder = `/${path.slice(0, path.lastIndexOf("/") + 1).toLowerCase()}`;
+  return path.toLowerCase().endsWith(".json") && KEYFRAMES.some((place) => folder.endsWith(`/${place}`));
 }
 
 /** Whether the last parts of a path, as many as a pattern in lower case has, fit it; * stands for any letters. @param {string} path @param {string} pattern */

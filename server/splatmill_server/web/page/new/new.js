@@ -15,6 +15,7 @@ import { Overlap } from "./looking/overlap.js";
 import { OptionsForm } from "./options.js";
 import { Start } from "./start.js";
 import { forget, recall } from "./remembered.js";
+import { listsIn } from "./zip.js";
 import { noticeOf, notify, startShell } from "../shell.js";
 
 /** Captures that are listed. */
@@ -123,9 +124,10 @@ function wireTools() {
 /** @param {import("./given.js").Given[]} given */
 async function take(given) {
   const documents = await documentsIn(given);
+  const lists = await listsIn(given, info.accepted.archives);
   if (!given.length) return notify("Nothing was found in what you dropped.", "warning");
   if (start.busy) return notify("Files are being sent. Pause first to give more.", "warning");
-  const added = items.add(given, documents);
+  const added = items.add(given, documents, lists);
   for (const item of added) {
     if (item.kind === "archive") void items.open(item).then(redraw);
     looking.add(item.id, item.file, item.kind, suffix(item.path));

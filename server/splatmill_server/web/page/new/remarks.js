@@ -1,7 +1,7 @@
 // Remarks on files before they are sent: those that are not read, and what is probably wrong with masks. The sentences
 // are those of the command line (client/splatmill/transfer/local_capture.py) and of the worker (images/masks.py); tests compare them.
 
-import { MAX_DEPTH, fits, stem, suffix, unmarked } from "./kinds.js";
+import { MAX_DEPTH, MODEL_PARTS, fits, stem, suffix, unmarked } from "./kinds.js";
 
 /** Share of the pixels of all photos that masks may hide without a remark. */
 const MOST_HIDDEN = 0.5;
@@ -12,7 +12,7 @@ const MOST_HIDDEN = 0.5;
  * @param {import("./kinds.js").Accepted} accepted
  * @returns {string[]}
  */
-export function remarks({ files, ignored, others, posed, idle }, accepted) {
+export function remarks({ files, ignored, others, posed, idle, zipped }, accepted) {
   const said = [];
   const read = new Map(accepted.unread.flatMap((kind) => kind.suffixes.map((ending) => [ending, kind])));
   /** @type {Map<import("./kinds.js").Accepted["unread"][0], string[]>} */
@@ -28,6 +28,10 @@ export function remarks({ files, ignored, others, posed, idle }, accepted) {
   if (idle.length) said.push(`Cameras are read where photos have the names in them; beside a video or a zip these files are not used: ${idle.join(", ")}.`);
   const beside = ignored.filter((path) => [...accepted.videos, ...accepted.archives].includes(suffix(path)));
   if (beside.length) said.push(`Videos and zips are not used where there are photos: ${beside.join(", ")}.`);
+  for (const { path, first, posed } of zipped) {
+    const why = posed ? "other cameras lie beside the photos" : "photos lie in the zip and beside it";
+    said.push(`The cameras in ${path} are not used, such as ${first}: ${why}. Give one folder or one zip with the photos and the cameras that belong to them.`);
+  }
   for (const what of accepted.unused_folders) {
     const paths = [...others].filter(([, kind]) => kind === what).map(([path]) => path);
     const more = paths.length > 1 ? ` and ${paths.length - 1} more` : "";
@@ -48,7 +52,7 @@ function unreadCameras(paths, accepted) {
     const path = first(patterns);
     return path ? [`The cameras of ${program} in ${path} are not read: ${recovered} To use those, export them from there as a COLMAP model or a transforms.json.`] : [];
   });
-  const part = first(["cameras.bin", "cameras.txt", "images.bin", "images.txt", "transforms*.json"]);
+  const part = first([...MODEL_PARTS, "transforms*.json"]);
   if (part) said.push(`${part} is not read: ${recovered} A COLMAP model has cameras and images, both as .bin or both as .txt, and lies at most ${MAX_DEPTH} folders down, as a transforms.json does.`);
   return said;
 }

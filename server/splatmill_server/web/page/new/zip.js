@@ -30,6 +30,22 @@ export async function namesIn(zip) {
   return null;
 }
 
+/**
+ * The names of the files in each zip among some files, by the path of the zip; one whose list cannot be read is left out.
+ * @param {import("./given.js").Given[]} given
+ * @param {string[]} archives suffixes with their dot, in lower case
+ * @returns {Promise<Map<string, string[]>>}
+ */
+export async function listsIn(given, archives) {
+  const lists = new Map();
+  for (const { path, file } of given) {
+    if (!archives.some((ending) => path.toLowerCase().endsWith(ending))) continue;
+    const inside = await namesIn(file).catch(() => null); // a file that cannot be read is named when it is sent
+    if (inside) lists.set(path, inside);
+  }
+  return lists;
+}
+
 /** @param {DataView} list @returns {string[] | null} */
 function names(list) {
   const encoded = [];
