@@ -249,7 +249,7 @@ def _cameras_in_zips(root: Path, names: Iterable[str]) -> dict[str, tuple[str, b
 
     A zip whose list of files cannot be read is left out: it is named with those that are not used.
     """
-    found: dict[str, tuple[str, bool]] = {}
+    zips: dict[str, tuple[str, bool]] = {}
     for name in names:
         if _suffix(name) not in ARCHIVE_SUFFIXES:
             continue
@@ -260,8 +260,8 @@ def _cameras_in_zips(root: Path, names: Iterable[str]) -> dict[str, tuple[str, b
             continue
         inside = sorted(each for each in entries if not each.endswith("/") and not _is_hidden(each))
         if cameras := camera_files(inside):
-            found[name] = cameras[0], holds_media(inside)
-    return found
+            zips[name] = cameras[0], holds_media(inside)
+    return zips
 
 
 def _is_hidden(name: str) -> bool:
