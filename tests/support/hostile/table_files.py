@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+from collections.abc import Callable
 
 import numpy as np
 from PIL import Image
@@ -15,12 +16,12 @@ from tests.support.hostile.pictures import encoded, noise, photo
 
 LEFT_OUT = "left out"
 
+Made = Callable[[], bytes]
+"""Makes the file when it is given: those that take long are not made by processes that only collect the tests."""
 
-def _picture(name: str, what: str, data: bytes | None, kind: str, said: str = "") -> Hostile:
-    def give(bench: Bench) -> Answer:
-        return bench.prepared(f"images/{name}", pictures.bomb() if data is None else data)
 
-    return Hostile("Pictures", what, give, kind, said)
+def _picture(name: str, what: str, data: bytes | Made, kind: str, said: str = "") -> Hostile:
+    return Hostile("Pictures", what, _prepared(f"images/{name}", data), kind, said)
 
 
 def _mask_of_its_shape(bench: Bench) -> Answer:
@@ -33,12 +34,16 @@ def _mask_of_another_shape(bench: Bench) -> Answer:
     return bench.prepared("masks/good.png", encoded(Image.new("L", (64, 64)), "PNG"))
 
 
-def _zip(what: str, data: bytes, kind: str, said: str = "") -> Hostile:
-    return Hostile("Archives", what, lambda bench: bench.prepared("images/set.zip", data), kind, said)
+def _zip(what: str, data: bytes | Made, kind: str, said: str = "") -> Hostile:
+    return Hostile("Archives", what, _prepared("images/set.zip", data), kind, said)
 
 
-def _video(name: str, what: str, data: bytes, kind: str, said: str = "") -> Hostile:
-    return Hostile("Videos", what, lambda bench: bench.prepared(f"images/{name}", data), kind, said)
+def _video(name: str, what: str, data: bytes | Made, kind: str, said: str = "") -> Hostile:
+    return Hostile("Videos", what, _prepared(f"images/{name}", data), kind, said)
+
+
+def _prepared(name: str, data: bytes | Made) -> Callable[[Bench], Answer]:
+    return lambda bench: bench.prepared(name, data if isinstance(data, bytes) else data())
 
 
 def _large_video(bench: Bench) -> Answer:
@@ -48,7 +53,7 @@ def _large_video(bench: Bench) -> Answer:
 _GREY16 = Image.fromarray(np.asarray(noise().convert("L"), np.uint16) * 257)
 
 FILES = (
-    _picture("a.png", "675 megapixels in 117 kB", None, LEFT_OUT, "27000 x 25000 pixels"),
+    _picture("a.png", "675 megapixels in 117 kB", pictures.bomb, LEFT_OUT, "27000 x 25000 pixels"),
     Hostile(
         "Pictures",
         "a mask of 675 megapixels in 117 kB",
@@ -101,7 +106,7 @@ FILES = (
         "used",
         "1 photo",
     ),
-    _picture("a.png", "a text that unpacks to 64 MB", pictures.text_bomb(), LEFT_OUT, "header"),
+    _picture("a.png", "a text that unpacks to 64 MB", pictures.text_bomb, LEFT_OUT, "header"),
     _picture("a.png", "a wrong checksum", encoded(noise(), "PNG").replace(b"IDAT", b"IDAT\x00", 1), LEFT_OUT),
     _picture("a.jpg", "the bytes of another photo", photo(99), LEFT_OUT, "the same as that of"),
     _zip("a name that leads outside, `../a.jpg`", packed({"../a.jpg": photo()}), LEFT_OUT, "outside"),
@@ -109,13 +114,13 @@ FILES = (
     _zip("a symbolic link", archives.with_link(), LEFT_OUT, "link"),
     _zip(
         "64 MB of zeros in 65 kB",
-        packed({"a.png": bytes(64 * 2**20)}, zipfile.ZIP_DEFLATED),
+        lambda: packed({"a.png": bytes(64 * 2**20)}, zipfile.ZIP_DEFLATED),
         LEFT_OUT,
         "bomb",
     ),
     _zip("200 files that share their bytes", archives.overlapping(), LEFT_OUT, "overlaps"),
-    _zip("100,000 files", archives.with_entries(100_000), LEFT_OUT, "list of files"),
-    _zip("25,000 files", archives.with_entries(25_000), LEFT_OUT, "at most 20000"),
+    _zip("100,000 files", lambda: archives.with_entries(100_000), LEFT_OUT, "list of files"),
+    _zip("25,000 files", lambda: archives.with_entries(25_000), LEFT_OUT, "at most 20000"),
     _zip("a zip in a zip", packed({"inner.zip": packed({"a.jpg": photo()})}), LEFT_OUT, "inside a zip"),
     _zip("encrypted", archives.encrypted(), LEFT_OUT, "encrypted"),
     _zip("a wrong checksum", archives.wrong_checksum(), LEFT_OUT, "damaged or cut off"),
@@ -125,8 +130,8 @@ FILES = (
     _zip("two files of one name", archives.twice(), LEFT_OUT, "two files"),
     _zip("damaged bzip2 data", archives.damaged_bzip2(), LEFT_OUT, "not a complete zip"),
     _zip("no zip at all", b"rubbish" * 100, LEFT_OUT, "not a complete zip"),
-    _video("a.mp4", "cut off", videos.video()[:4000], LEFT_OUT, "does not decode"),
-    _video("a.webm", "without a length, as browsers record", videos.without_length(), "used", "4 photos"),
+    _video("a.mp4", "cut off", lambda: videos.video()[:4000], LEFT_OUT, "does not decode"),
+    _video("a.webm", "without a length, as browsers record", videos.without_length, "used", "4 photos"),
     _video(
         "a.mp4",
         "a playlist of other files, called `.mp4`",
@@ -144,11 +149,17 @@ FILES = (
     _video(
         "a.mp4",
         "a codec that does not exist",
-        videos.video().replace(b"avc1", b"zzzz"),
+        lambda: videos.video().replace(b"avc1", b"zzzz"),
         LEFT_OUT,
         "not known",
     ),
-    _video("a.mov", "MPEG-TS called `.mov`", videos.video("mpegts"), LEFT_OUT, "does not decode as an MP4"),
+    _video(
+        "a.mov",
+        "MPEG-TS called `.mov`",
+        lambda: videos.video("mpegts"),
+        LEFT_OUT,
+        "does not decode as an MP4",
+    ),
     Hostile("Videos", "frames of 8,208 x 4,336 pixels", _large_video, LEFT_OUT, "35 million pixels"),
     _video("a.mp4", "a photo called `.mp4`", photo(), LEFT_OUT, "does not decode as an MP4"),
 )

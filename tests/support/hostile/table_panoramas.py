@@ -60,7 +60,13 @@ PANORAMAS = (
         LEFT_OUT,
         "which is not read",
     ),
-    _row("20,000 x 10,000 pixels in 25 kB", _large(), "used", "1 photo"),
+    Hostile(
+        AREA,
+        "20,000 x 10,000 pixels in 25 kB",
+        lambda bench: bench.prepared("images/sphere.jpg", _large()),
+        "used",
+        "1 photo",
+    ),
     Hostile(
         AREA,
         "a mask of one with the shape of one of its faces",

@@ -166,22 +166,30 @@ def inverted(targets: list[Target]) -> list[Target]:
 @pytest.mark.parametrize(
     ("targets", "reason"),
     [
-        pytest.param(photos(sphere, 1), "1 photos have transparent", id="one photo"),
+        pytest.param(lambda: photos(sphere, 1), "1 photos have transparent", id="one photo"),
         pytest.param(
-            [target._replace(alpha=None) for target in photos(sphere, 5)], "0 photos have", id="opaque"
+            lambda: [target._replace(alpha=None) for target in photos(sphere, 5)],
+            "0 photos have",
+            id="opaque",
         ),
         pytest.param(
-            [target._replace(alpha=torch.zeros_like(target.rgb[..., 0])) for target in photos(sphere, 5)],
+            lambda: [
+                target._replace(alpha=torch.zeros_like(target.rgb[..., 0])) for target in photos(sphere, 5)
+            ],
             "0 photos have",
             id="all transparent",
         ),
-        pytest.param(inverted(photos(sphere)), "do not bound an object", id="inverted"),
-        pytest.param([photo(around(1)[0], sphere) for _ in range(6)], "look the same way", id="one camera"),
-        pytest.param(photos(box(9.0, 9.0, 0.02)), "do not bound an object", id="cut by every frame"),
+        pytest.param(lambda: inverted(photos(sphere)), "do not bound an object", id="inverted"),
+        pytest.param(
+            lambda: [photo(around(1)[0], sphere) for _ in range(6)], "look the same way", id="one camera"
+        ),
+        pytest.param(lambda: photos(box(9.0, 9.0, 0.02)), "do not bound an object", id="cut by every frame"),
     ],
 )
-def test_outlines_that_bound_nothing_are_refused_with_the_reason(targets: list[Target], reason: str) -> None:
-    found = visual_hull(targets, MOST)
+def test_outlines_that_bound_nothing_are_refused_with_the_reason(
+    targets: Callable[[], list[Target]], reason: str
+) -> None:
+    found = visual_hull(targets(), MOST)
     assert isinstance(found, NoHull)
     assert reason in found.reason
 
