@@ -72,7 +72,7 @@ def test_e_to_the_x_stays_at_the_ends_of_its_range(build: str, x: float, end: fl
 @pytest.mark.parametrize("function", FUNCTIONS, ids=lambda f: f.name)
 def test_the_headers_say_what_was_measured(function: Function) -> None:
     """The comment above each function names a bound, which holds and is not much larger than what is known."""
-    text = (ROOT / "worker/splatmill_worker/kernels/cpu" / function.header).read_text()
+    text = (ROOT / "worker/splatmill_worker/kernels/cpu/simd" / function.header).read_text()
     comment = re.search(rf"((?://.*\n)+)SPLATMILL_INLINE Float {function.name}\(Float x\)", text)
     if function.name == "sqrt":  # the processor's own
         assert comment is None

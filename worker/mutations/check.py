@@ -46,7 +46,7 @@ def faults() -> Iterator[str]:
     sources = {
         str(path.relative_to(kernels))
         for backend in ("cpu", "gpu", "reference")
-        for path in (kernels / backend).iterdir()
+        for path in (kernels / backend).rglob("*")
         if path.suffix in (".cpp", ".hpp", ".py")
     }
     for file in sorted(sources ^ (mutated | set(WITHOUT))):

@@ -92,7 +92,8 @@ PROOFS = {
     "gpu/projection": [*PROJECTION, f"{GPU_OPS}the_length_of_a_quaternion_does_not_matter"],
     "gpu/harmonics": PROJECTION[::-1],
 }
-"""The tests most likely to catch a fault in a file, by its path without suffix. Where none are named: `DEFAULT`."""
+"""The tests most likely to catch a fault in a file, by its backend and its name without suffix. Where none are named:
+`DEFAULT`."""
 
 DEFAULT = {
     "cpu": GRADIENTS,
@@ -184,7 +185,7 @@ def module_of(copy: Copy, mutant: Mutant | None) -> str:
 
 def prove(copy: Copy, mutant: Mutant) -> str:
     """The first test that fails, or nothing. The likeliest run alone, then all others."""
-    first = PROOFS.get(str(Path(mutant.file).with_suffix("")), DEFAULT[mutant.backend])
+    first = PROOFS.get(f"{mutant.backend}/{Path(mutant.file).stem}", DEFAULT[mutant.backend])
     rest = [name for name in (ALL_GPU if mutant.backend == "gpu" else ALL) if name not in first]
     return pytest(copy, mutant, [f"{TESTS}/{name}" for name in first]) or pytest(
         copy, mutant, [f"{TESTS}/{name}" for name in rest]
@@ -244,7 +245,7 @@ def tried(copy: Copy, mutant: Mutant) -> Row:
     copy.mutated.touch()
     path.write_text(source.replace(mutant.before, mutant.after))
     try:
-        caught = pytest(copy, mutant, [f"{TESTS}/{FUNCTIONS}"]) if mutant.file == "cpu/math.hpp" else ""
+        caught = pytest(copy, mutant, [f"{TESTS}/{FUNCTIONS}"]) if mutant.file == "cpu/simd/math.hpp" else ""
         if not caught:
             works, said = (True, "") if mutant.file.endswith(".py") else build(copy)
             if not works:

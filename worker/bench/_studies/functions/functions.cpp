@@ -6,8 +6,8 @@
 #include <cstring>
 #include <limits>
 
-#include "math.hpp"
-#include "threads.hpp"
+#include "simd/math.hpp"
+#include "simd/threads.hpp"
 
 namespace splatmill {
 namespace {

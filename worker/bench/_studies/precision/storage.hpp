@@ -1,5 +1,5 @@
 // The narrow formats that `bench precision` compares with float32, and the aliases that put them in its place: see
-// kernels/cpu/storage.hpp, which includes this file where SPLATMILL_STORAGE names it.
+// kernels/cpu/layout/storage.hpp, which includes this file where SPLATMILL_STORAGE names it.
 #pragma once
 
 namespace splatmill {

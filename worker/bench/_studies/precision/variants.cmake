@@ -6,13 +6,14 @@ set(halves_avx2 -mf16c)
 function(compiled target)
   target_compile_options(${target} PRIVATE ${flags} ${${SPLATMILL_VARIANT_ISA}} ${halves_${SPLATMILL_VARIANT_ISA}}
     $<$<CXX_COMPILER_ID:GNU,Clang>:-fno-stack-protector>)
+  target_include_directories(${target} PRIVATE ${kernels})
   target_link_libraries(${target} PRIVATE nanobind-static OpenMP::OpenMP_CXX)
   set_target_properties(${target} PROPERTIES POSITION_INDEPENDENT_CODE ON)
 endfunction()
 
 # variant(NAME "DEFINITIONS" SOURCES...): the module _cpu_ISA in the folder NAME; SOURCES are the stems that see the definitions.
 function(variant name definitions)
-  set(own ${kernels}/module.cpp)
+  set(own ${kernels}/bindings/module.cpp)
   set(shared)
   foreach(source ${sources})
     get_filename_component(stem ${source} NAME_WE)

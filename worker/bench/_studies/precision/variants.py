@@ -20,8 +20,8 @@ class Variant:
     name: also that of its folder.
     kind: what it changes, the same for those that are drawn alike.
     text: the change, in words.
-    harmonics, first, second, record: formats of kernels/cpu/storage.hpp and storage.hpp here, for SH coefficients,
-        Adam's moments and projected records.
+    harmonics, first, second, record: formats of kernels/cpu/layout/storage.hpp and storage.hpp here, for SH
+        coefficients, Adam's moments and projected records.
     constants: other compile definitions.
     sources: stems of the C++ files that see the change.
     """

@@ -2,8 +2,8 @@
 #include <algorithm>
 #include <vector>
 
-#include "bindings.hpp"
-#include "threads.hpp"
+#include "bindings/bindings.hpp"
+#include "simd/threads.hpp"
 
 namespace splatmill {
 namespace {

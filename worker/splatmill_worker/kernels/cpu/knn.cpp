@@ -4,8 +4,8 @@
 #include <numeric>
 #include <vector>
 
-#include "bindings.hpp"
-#include "threads.hpp"
+#include "bindings/bindings.hpp"
+#include "simd/threads.hpp"
 
 namespace splatmill {
 namespace {

@@ -3,7 +3,7 @@
 The window of SSIM is separable: two kernels apply it to the moments, across and then down, and two to the derivatives.
 Its eleven shifted reads hit the first-level cache; between the kernels, three planes per channel go through memory.
 Moments are those of the rendering's difference from the photo, and the photo's variance is taken about a centre nearby:
-bright, even colours keep the digits of their contrast. The formulas stand at the head of `cpu/loss.cpp`.
+bright, even colours keep the digits of their contrast. The formulas stand at the head of `cpu/training/loss.cpp`.
 """
 
 from __future__ import annotations

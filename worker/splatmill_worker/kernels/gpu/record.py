@@ -6,7 +6,7 @@ they would be six or more.
 The shape is held as the triangular factor F = [[ux, uy], [0, vy]] of the conic, C = 2 ln 2 F^T F, and the opacity as
 its logarithm: log2 alpha = level - u^2 - v^2 with u = ux dx + uy dy and v = vy dy at the offset (dx, dy) from the mean.
 Three float32 numbers of a conic know the short axis of a needle only to the axis ratio squared times the roundoff, the
-factor to a few roundoffs (decisions: gpu-records). `kernels/cpu/layout.hpp` has the same record.
+factor to a few roundoffs (decisions: gpu-records). `kernels/cpu/layout/layout.hpp` has the same record.
 
 The separate ops exchange conics all the same (`Projected`): `fields` and `pack` go from one form to the other, and lose
 the digits that a conic loses. The training step stays with records.
