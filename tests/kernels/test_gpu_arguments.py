@@ -17,7 +17,7 @@ pytest.importorskip(
 )
 
 from splatmill_worker.kernels import ops
-from splatmill_worker.kernels.gpu.argument import declared
+from splatmill_worker.kernels.gpu.launch.argument import declared
 from splatmill_worker.kernels.gpu.step import Step
 from splatmill_worker.kernels.records import Rates
 from tests.support.kernels.cases import scene

@@ -82,7 +82,7 @@ def test_every_kernel_of_the_package_is_in_the_list() -> None:
     folder = Path(spec.origin).parent
     written = {
         node.name
-        for file in folder.glob("*.py")
+        for file in folder.rglob("*.py")
         for node in ast.walk(ast.parse(file.read_text()))
         if isinstance(node, ast.FunctionDef) and node.name.endswith("_kernel")
     }

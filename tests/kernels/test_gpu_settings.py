@@ -32,9 +32,9 @@ from splatmill_worker.kernels.gpu import (
     project,
     project_backward,
     step,
-    tuning,
 )
 from splatmill_worker.kernels.gpu.blended import SEGMENT
+from splatmill_worker.kernels.gpu.launch import tuning
 from splatmill_worker.kernels.gpu.step import Step
 from splatmill_worker.kernels.records import BETA1, GROUPS, Rates
 from splatmill_worker.splat.views import over

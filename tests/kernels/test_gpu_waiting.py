@@ -89,7 +89,7 @@ def test_a_host_that_runs_ahead_waits_for_a_step_long_past(
     case: Case, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ahead = 2
-    monkeypatch.setattr("splatmill_worker.kernels.gpu.readback.AHEAD", ahead)
+    monkeypatch.setattr("splatmill_worker.kernels.gpu.transfers.readback.AHEAD", ahead)
     late, here = LateDevice(monkeypatch), engine(case)
     waits: list[int] = []
     for step in range(1, ahead + 4):

@@ -16,7 +16,7 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from splatmill_worker.kernels import gpu
-from splatmill_worker.kernels.gpu.transfer import ToHost
+from splatmill_worker.kernels.gpu.transfers.transfer import ToHost
 
 
 class Launch(NamedTuple):
@@ -63,9 +63,8 @@ class WatchedKernel:
 def watch(monkeypatch: pytest.MonkeyPatch, told: Callable[[Launch], None]) -> dict[str, Any]:
     """Have every kernel of the package tell of its launches; returns the kernels themselves by name."""
     found: dict[str, Any] = {}
-    for module in [
-        importlib.import_module(f"{gpu.__name__}.{m.name}") for m in pkgutil.iter_modules(gpu.__path__)
-    ]:
+    names = [each.name for each in pkgutil.walk_packages(gpu.__path__, f"{gpu.__name__}.")]
+    for module in [importlib.import_module(name) for name in names]:
         for name in [name for name in vars(module) if name.endswith("_kernel")]:
             found[name] = getattr(module, name)
             monkeypatch.setattr(module, name, WatchedKernel(name, found[name], told))
@@ -149,7 +148,7 @@ class LateDevice:
                 with looking_away():
                     return super().wait()
 
-        for module in ("step", "readback"):
+        for module in ("step", "transfers.readback"):
             monkeypatch.setattr(f"{gpu.__name__}.{module}.ToHost", Late)
 
 

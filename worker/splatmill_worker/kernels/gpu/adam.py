@@ -15,9 +15,9 @@ from torch import Tensor
 
 from ..records import BETA1, EPS, GROUPS
 from ..reference.adam import MEMORY
-from .argument import Bytes, Float, Floats, Int, Ints
-from .constant import LARGEST, constant
-from .transfer import to_device
+from .launch.argument import Bytes, Float, Floats, Int, Ints
+from .launch.constant import LARGEST, constant
+from .transfers.transfer import to_device
 
 B1, EPSILON = constant(BETA1), constant(EPS)
 LOG2_B1 = constant(math.log2(BETA1))

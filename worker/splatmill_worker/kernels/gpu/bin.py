@@ -12,8 +12,8 @@ from torch import Tensor
 
 from ..records import ALPHA_MIN, MOST_PAIRS, TILE, Bins, Projected, TooManyPairs
 from . import device, record
-from .argument import Floats, Int, Ints, Longs, Shorts
-from .constant import constant
+from .launch.argument import Floats, Int, Ints, Longs, Shorts
+from .launch.constant import constant
 from .record import DEPTH, EXTENT_X, EXTENT_Y, FACTOR_UX, FACTOR_UY, FACTOR_VY, LEVEL, MEAN_X, MEAN_Y, STRIDE
 
 SIDE = constant(float(TILE))

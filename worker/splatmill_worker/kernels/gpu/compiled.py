@@ -1,7 +1,7 @@
 """Compile every kernel for a GPU that need not be present, and read registers, spills and shared memory off the binary.
 
-`python -m splatmill_worker.kernels.gpu.compiled 80 90` prints one JSON line per kernel, launch setting and architecture
-(80 is sm_80). With --first it compiles each kernel only in the setting used where nothing was measured.
+`python -m splatmill_worker.kernels.gpu.compiled 80 90` prints one JSON line per kernel, launch setting and
+architecture (80 is sm_80). With --first it compiles each kernel only in the setting used where nothing was measured.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ from . import (
     project_backward,
     step,
 )
-from .argument import declared
 from .blended import SEGMENT
+from .launch.argument import declared
 
 
 @dataclass(frozen=True)

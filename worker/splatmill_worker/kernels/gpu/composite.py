@@ -12,8 +12,9 @@ from torch.autograd.function import once_differentiable
 
 from ..records import TILE, Bins, Projected
 from . import device, record
-from .argument import Floats, Int, Ints, Longs
-from .blend import (
+from .blended import PLANES, SEGMENT, Blended
+from .composite_backward import blend_backward
+from .device_functions.blend import (
     MOST,
     PIXELS,
     STOP,
@@ -24,8 +25,8 @@ from .blend import (
     store_checkpoint,
     tile_pixels,
 )
-from .blended import PLANES, SEGMENT, Blended
-from .composite_backward import blend_backward
+from .launch.argument import Floats, Int, Ints, Longs
+from .launch.tuning import COMPOSITE, autotune
 from .record import (
     BLUE,
     DEPTH,
@@ -40,7 +41,6 @@ from .record import (
     RED,
     STRIDE,
 )
-from .tuning import COMPOSITE, autotune
 
 
 @autotune(COMPOSITE, key=["WITH_DEPTH", "CHECKPOINTS"])

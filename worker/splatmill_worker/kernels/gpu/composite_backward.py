@@ -8,8 +8,8 @@ import triton.language as tl
 from torch import Tensor
 
 from ..records import TILE, Bins
-from .argument import Floats, Int, Ints, Longs
-from .blend import (
+from .blended import SEGMENT, Blended
+from .device_functions.blend import (
     MOST,
     PIXELS,
     STOP,
@@ -20,8 +20,9 @@ from .blend import (
     raw_alpha,
     tile_pixels,
 )
-from .blended import SEGMENT, Blended
-from .projection import LN2
+from .device_functions.projection import LN2
+from .launch.argument import Floats, Int, Ints, Longs
+from .launch.tuning import COMPOSITE_BACKWARD, autotune
 from .record import (
     BLUE,
     DEPTH,
@@ -43,7 +44,6 @@ from .record import (
     SUM_QUV,
     SUM_QVV,
 )
-from .tuning import COMPOSITE_BACKWARD, autotune
 
 
 @triton.jit

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from ..reference.knn import NEIGHBORS, check_points
 from . import device
-from .argument import Float, Floats, Int
-from .constant import constant
+from .launch.argument import Float, Floats, Int
+from .launch.constant import constant
 
 ROWS = 64
 """Points per program."""

@@ -19,10 +19,10 @@ from torch.autograd.function import once_differentiable
 
 from ..reference.loss import C1, C2, SIGMA, WINDOW, PhotoStats
 from . import device
-from .argument import Bytes, Float, Floats, Int
-from .constant import constant
-from .transfer import to_device
-from .tuning import LOSS, SMALLEST_LOSS_BLOCK, autotune
+from .launch.argument import Bytes, Float, Floats, Int
+from .launch.constant import constant
+from .launch.tuning import LOSS, SMALLEST_LOSS_BLOCK, autotune
+from .transfers.transfer import to_device
 
 REACH = constant(WINDOW // 2)
 TAPS = constant(WINDOW)

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from ..records import NEAREST_HORIZON, TILE, Bins, Projected
 from . import device, record
-from .argument import Float, Floats, Int, Ints, Longs
-from .blend import LEAST, MOST, PIXELS, along_factor, raw_alpha, tile_pixels
-from .constant import constant
+from .device_functions.blend import LEAST, MOST, PIXELS, along_factor, raw_alpha, tile_pixels
+from .launch.argument import Float, Floats, Int, Ints, Longs
+from .launch.constant import constant
 from .record import DEPTH, FACTOR_UX, FACTOR_UY, FACTOR_VY, LEVEL, MEAN_X, MEAN_Y, STRIDE
 
 HORIZON = constant(NEAREST_HORIZON)

@@ -12,9 +12,9 @@ from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from ..reference.loss import PhotoStats
-from .argument import Bytes, Floats, Int
+from .launch.argument import Bytes, Floats, Int
 from .loss import photo_stats
-from .transfer import to_device
+from .transfers.transfer import to_device
 
 STATS_BYTES = 24
 """Bytes of a pixel's statistics: mean and variance of three channels, float32."""

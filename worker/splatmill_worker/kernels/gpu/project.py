@@ -13,11 +13,8 @@ from torch.autograd.function import once_differentiable
 
 from ..records import ALPHA_MIN, Projected
 from . import device, record
-from .argument import Float, Floats, Int
-from .constant import constant
-from .harmonics import shade
-from .project_backward import project_backward
-from .projection import (
+from .device_functions.harmonics import shade
+from .device_functions.projection import (
     COMPENSATION_MIN,
     LN2,
     covariance,
@@ -31,6 +28,10 @@ from .projection import (
     slope_row,
     through,
 )
+from .launch.argument import Float, Floats, Int
+from .launch.constant import constant
+from .launch.tuning import PROJECT, autotune
+from .project_backward import project_backward
 from .record import (
     BLUE,
     DEPTH,
@@ -47,7 +48,6 @@ from .record import (
     RED,
     STRIDE,
 )
-from .tuning import PROJECT, autotune
 
 CUT = constant(ALPHA_MIN)
 LOG2_CUT = constant(math.log2(ALPHA_MIN))

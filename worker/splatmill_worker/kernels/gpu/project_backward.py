@@ -7,9 +7,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from .argument import Floats, Int
-from .harmonics import at, basis, shade, slope
-from .projection import (
+from .device_functions.harmonics import at, basis, shade, slope
+from .device_functions.projection import (
     BLUR,
     LN2,
     covariance,
@@ -22,6 +21,8 @@ from .projection import (
     slope_row,
     through,
 )
+from .launch.argument import Floats, Int
+from .launch.tuning import PROJECT_BACKWARD, autotune
 from .record import (
     BLUE,
     DEPTH,
@@ -37,7 +38,6 @@ from .record import (
     SUM_QUV,
     SUM_QVV,
 )
-from .tuning import PROJECT_BACKWARD, autotune
 
 
 @triton.jit

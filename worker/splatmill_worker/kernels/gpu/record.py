@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from ..records import Projected
-from .constant import constant
+from .launch.constant import constant
 
 WIDTH = 12
 """Floats of a record."""

@@ -16,18 +16,18 @@ from torch import Tensor
 from splatmill_worker.kernels.records import BETA2, GROUPS, MOST_PAIRS, PARAMETERS, Rates
 
 from . import adam, device
-from .argument import Float, Floats, Int
 from .bin import Lists, Room, lists
 from .blended import Blended
 from .composite import blend
 from .composite_backward import blend_backward
+from .launch.argument import Float, Floats, Int
 from .loss import loss_and_gradient
 from .photos import Photos
 from .project import project_records
 from .project_backward import project_backward
-from .readback import Readback
 from .record import EXTENT_X, EXTENT_Y, GRADIENT_STRIDE, MEAN_X, MEAN_Y, STRIDE
-from .transfer import ToHost, to_device
+from .transfers.readback import Readback
+from .transfers.transfer import ToHost, to_device
 
 ViewKey = tuple[int, int, int]
 """What a view is recognised by: address of its viewmat, width and height in pixels."""

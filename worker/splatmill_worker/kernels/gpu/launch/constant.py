@@ -6,7 +6,7 @@ from typing import Any
 
 import triton.language as tl
 
-from .device import interpreting
+from ..device import interpreting
 
 
 def constant(value: float) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from .constant import constant
+from ..launch.constant import constant
 
 A0 = constant(0.28209479177387814)
 A1 = constant(0.4886025119029199)

@@ -7,7 +7,7 @@ from typing import Any
 
 import triton
 
-from .device import interpreting
+from ..device import interpreting
 
 # One setting for the passes that are bound by memory; several for those that walk the lists.
 PROJECT = [triton.Config({"BLOCK": 128}, num_warps=4)]

@@ -10,9 +10,10 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from ..records import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN
-from .blended import PLANES
-from .constant import constant
+from splatmill_worker.kernels.records import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN
+
+from ..blended import PLANES
+from ..launch.constant import constant
 
 PIXELS = constant(TILE * TILE)
 SIDE = constant(TILE)

@@ -7,8 +7,9 @@ import math
 import triton
 import triton.language as tl
 
-from .. import records
-from .constant import LARGEST, constant
+from splatmill_worker.kernels import records
+
+from ..launch.constant import LARGEST, constant
 from .harmonics import at
 
 BLUR = constant(records.BLUR)

@@ -1,0 +1,1 @@
+"""The device functions that two passes share."""
