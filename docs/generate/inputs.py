@@ -18,12 +18,14 @@ from splatmill.schema.files.photos import (
     UNREAD_KINDS,
     VIDEO_FORMATS,
 )
-from splatmill_worker.images import faces, guarded, mask_levels, overlay, panoramas, prepare
+from splatmill_worker.images import guarded, mask_levels, prepare
 from splatmill_worker.images.archives import archive, zip_names
-from splatmill_worker.images.colors import PRIMARIES, TRANSFERS, Colors
+from splatmill_worker.images.colors.colors import PRIMARIES, TRANSFERS, Colors
+from splatmill_worker.images.colors.photo_colors import PhotoColors
 from splatmill_worker.images.lens import PANORAMA, PINHOLE_MODELS
 from splatmill_worker.images.no_photo import TRAITS
-from splatmill_worker.images.photo_colors import PhotoColors
+from splatmill_worker.images.overlays import overlay
+from splatmill_worker.images.panoramas import faces, panoramas
 from splatmill_worker.readers import scan
 from splatmill_worker.readers.colmap_files import MODELS
 from splatmill_worker.readers.programs.shots import MAX_LENGTH_ERROR

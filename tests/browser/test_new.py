@@ -21,7 +21,7 @@ from PIL import Image, ImageFilter
 from playwright.sync_api import Locator, Page, Request, expect
 
 from splatmill.schema import MIN_PHOTOS, describe_options
-from splatmill_worker.images.panoramas import by_edges, stated
+from splatmill_worker.images.panoramas.panoramas import by_edges, stated
 from splatmill_worker.images.prepare import prepare
 from tests.browser.conftest import Open, SmallModel, Visit
 from tests.support import still_life

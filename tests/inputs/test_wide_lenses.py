@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from splatmill_worker.images import faces
+from splatmill_worker.images.panoramas import faces
 from splatmill_worker.images.prepare import prepare
 from splatmill_worker.sfm import posed
 from tests.inputs.conftest import Build

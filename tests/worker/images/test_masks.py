@@ -13,8 +13,8 @@ from PIL import Image
 
 from splatmill_worker import sfm
 from splatmill_worker.errors import Refusal, SfmFailed
-from splatmill_worker.images import overlays
 from splatmill_worker.images.load import load_view
+from splatmill_worker.images.overlays import overlays
 from splatmill_worker.images.prepare import Prepared, prepare
 from splatmill_worker.sfm import features, posed
 from splatmill_worker.sfm.features import FeatureStore

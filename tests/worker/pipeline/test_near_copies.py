@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 from splatmill.schema import TrainOptions
-from splatmill_worker.images import overlays
+from splatmill_worker.images.overlays import overlays
 from splatmill_worker.pipeline.holdout import honest_split, split_views
 from splatmill_worker.scene import Camera, Scene, View, viewmat_of
 from splatmill_worker.synthetic import photograph

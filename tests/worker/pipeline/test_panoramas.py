@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from splatmill_worker.images import faces
 from splatmill_worker.images.lens import PANORAMA
+from splatmill_worker.images.panoramas import faces
 from splatmill_worker.scene import Camera, Float, Lens, View
 from splatmill_worker.sfm.posed.transforms import OPENGL_TO_OPENCV
 from splatmill_worker.splat.formats import registry

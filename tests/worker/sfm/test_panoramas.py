@@ -14,7 +14,7 @@ from PIL import Image
 
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.errors import SfmFailed
-from splatmill_worker.images.faces import joined
+from splatmill_worker.images.panoramas.faces import joined
 from splatmill_worker.scene import Float, Scene, viewmat_of
 from splatmill_worker.sfm import SfmOptions, reconstruct
 from splatmill_worker.synthetic import look_at

@@ -12,7 +12,7 @@ from PIL import Image, ImageFile
 
 from splatmill_worker.errors import UnusablePicture
 from splatmill_worker.images import guarded, transparency
-from splatmill_worker.images.photo_colors import PhotoColors
+from splatmill_worker.images.colors.photo_colors import PhotoColors
 
 Pixels = npt.NDArray[np.uint8]
 ORIENTATION = 0x0112

@@ -13,7 +13,8 @@ from pydantic import PlainValidator
 
 from splatmill.schema.files.photos import MIN_PHOTO_SIDE
 from splatmill_worker.errors import UnusablePicture
-from splatmill_worker.images import exif, guarded, panoramas, transparency
+from splatmill_worker.images import exif, guarded, transparency
+from splatmill_worker.images.colors.photo_colors import PhotoColors
 from splatmill_worker.images.copies import SMALL_SIDE, small_grey
 from splatmill_worker.images.decode import (
     UPRIGHT,
@@ -25,7 +26,7 @@ from splatmill_worker.images.decode import (
     whole,
 )
 from splatmill_worker.images.no_photo import Kind, kind_of
-from splatmill_worker.images.photo_colors import PhotoColors
+from splatmill_worker.images.panoramas import panoramas
 from splatmill_worker.wording import plain
 
 GIVE = "; give JPEG, PNG, WebP, TIFF, HEIC or AVIF photos, videos or zips"

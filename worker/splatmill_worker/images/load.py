@@ -16,10 +16,11 @@ import numpy.typing as npt
 import torch
 from PIL import Image
 
-from splatmill_worker.images import decoded_panoramas, faces, look_ups
+from splatmill_worker.images import look_ups
 from splatmill_worker.images.decode import Pixels
 from splatmill_worker.images.decoding.decoders import decode
 from splatmill_worker.images.masks import shown_part
+from splatmill_worker.images.panoramas import decoded_panoramas, faces
 from splatmill_worker.images.pixel_files import PixelFiles
 from splatmill_worker.scene import MIN_SHOWN, Camera, Lens, View
 

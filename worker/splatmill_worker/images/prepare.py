@@ -20,20 +20,14 @@ from splatmill.schema.files.outputs import own_outputs
 from splatmill.schema.files.photos import ARCHIVE_SUFFIXES, VIDEO_SUFFIXES, unread, unread_kind
 from splatmill.schema.quantities import counted
 from splatmill_worker.errors import Cancelled, CaptureIncomplete, UnusablePicture, UnusableVideo
-from splatmill_worker.images import (
-    copies,
-    exif,
-    mask_levels,
-    no_photo,
-    overlays,
-    panoramas,
-    photo_colors,
-    transparency,
-)
+from splatmill_worker.images import copies, exif, mask_levels, no_photo, transparency
 from splatmill_worker.images.archives import archive, unpacked_room
+from splatmill_worker.images.colors import photo_colors
 from splatmill_worker.images.copies import SmallPicture
 from splatmill_worker.images.decoding import decoders
 from splatmill_worker.images.masks import masks_under, unfit
+from splatmill_worker.images.overlays import overlays
+from splatmill_worker.images.panoramas import panoramas
 from splatmill_worker.scene import MIN_SHOWN, Overlay
 from splatmill_worker.wording import plain
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from splatmill.schema import LogEvent
-from splatmill_worker.images import faces
+from splatmill_worker.images.panoramas import faces
 from splatmill_worker.pipeline.capture import posed_scene
 from splatmill_worker.pipeline.events import progress_events
 from splatmill_worker.pipeline.holdout import honest_split

@@ -10,8 +10,9 @@ from splatmill.data_sets import TwoDataSets
 from splatmill.schema import TrainOptions, known_distance
 from splatmill_worker import sfm
 from splatmill_worker.errors import Refusal
-from splatmill_worker.images import faces, overlays
 from splatmill_worker.images.masks import mask_folder
+from splatmill_worker.images.overlays import overlays
+from splatmill_worker.images.panoramas import faces
 from splatmill_worker.images.prepare import names_remark
 from splatmill_worker.pipeline import example, given_points, one_place
 from splatmill_worker.scene import Scene

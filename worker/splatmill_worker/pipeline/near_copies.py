@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from splatmill_worker.images.copies import SMALL_SIDE, SmallPicture, is_copy, small_grey
 from splatmill_worker.images.decoding import decoders
-from splatmill_worker.images.faces import faces_of, is_panorama
+from splatmill_worker.images.panoramas.faces import faces_of, is_panorama
 from splatmill_worker.scene import Float, Scene, View, looked_at
 from splatmill_worker.sfm.posed.same_bytes import ONE_CAMERA
 

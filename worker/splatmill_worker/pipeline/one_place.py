@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from splatmill_worker.images.faces import photos_of
+from splatmill_worker.images.panoramas.faces import photos_of
 from splatmill_worker.scene import Scene
 
 LEAST_BASELINE = 0.05

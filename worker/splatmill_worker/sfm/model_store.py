@@ -10,8 +10,8 @@ from typing import Any
 
 from splatmill.schema import KnownDistance, ModelFrame
 from splatmill_worker.colmap import pycolmap, write_model
-from splatmill_worker.images import faces
 from splatmill_worker.images.lens import remarks
+from splatmill_worker.images.panoramas import faces
 from splatmill_worker.images.prepare import Prepared
 from splatmill_worker.scene import Scene, View
 from splatmill_worker.sfm import features, stereo

@@ -17,7 +17,7 @@ import numpy.typing as npt
 import pytest
 from PIL import Image
 
-from splatmill_worker.images.colors import Colors, srgb, srgb_pixels
+from splatmill_worker.images.colors.colors import Colors, srgb, srgb_pixels
 from splatmill_worker.images.decoding import decoders
 from splatmill_worker.images.prepare import prepare
 from splatmill_worker.images.video import video_frame

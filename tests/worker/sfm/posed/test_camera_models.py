@@ -14,7 +14,7 @@ import pytest
 
 from splatmill.schema import TrainOptions
 from splatmill_worker.errors import Refusal
-from splatmill_worker.images import faces
+from splatmill_worker.images.panoramas import faces
 from splatmill_worker.pipeline.capture import posed_scene
 from splatmill_worker.scene import Lens, Scene
 from splatmill_worker.sfm.posed import camera_models

@@ -14,7 +14,7 @@ from av.filter import Graph
 from av.video.reformatter import ColorRange, Interpolation
 from PIL import Image
 
-from splatmill_worker.images.colors import SRGB, srgb_pixels
+from splatmill_worker.images.colors.colors import SRGB, srgb_pixels
 from splatmill_worker.images.flow import Grey
 from splatmill_worker.images.video.video_tags import Tags, tags_of
 
@@ -45,7 +45,7 @@ XMP = (
     '<rdf:Description xmlns:GPano="http://ns.google.com/photos/1.0/panorama/" GPano:ProjectionType="{}"/>'
     "</rdf:RDF></x:xmpmeta>"
 )
-"""By which a frame is a panorama for those that read it as a photo (`images.panoramas`)."""
+"""By which a frame is a panorama for those that read it as a photo (`images.panoramas.panoramas`)."""
 
 Pixels = npt.NDArray[np.uint8]
 

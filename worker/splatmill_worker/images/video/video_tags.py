@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import av
 from av.video.reformatter import ColorRange, Colorspace
 
-from splatmill_worker.images.colors import PRIMARIES, TRANSFERS, Colors
+from splatmill_worker.images.colors.colors import PRIMARIES, TRANSFERS, Colors
 
 MATRICES = {
     1: Colorspace.ITU709,

@@ -23,11 +23,11 @@ from splatmill.schema.files.photos import ARCHIVE_SUFFIXES, PHOTO_SUFFIXES, VIDE
 from splatmill.schema.quantities import listed
 from splatmill_worker.errors import UnusablePicture
 from splatmill_worker.images import lens, mask_levels, transparency
+from splatmill_worker.images.colors.photo_colors import sentences
 from splatmill_worker.images.decoding import decoders
 from splatmill_worker.images.decoding.decoders import mask_fault, photo_colors
 from splatmill_worker.images.examine import too_small
 from splatmill_worker.images.masks import unfit
-from splatmill_worker.images.photo_colors import sentences
 from splatmill_worker.images.prepare import names_remark
 from splatmill_worker.scene import Scene, Source, View, without
 from splatmill_worker.sfm.posed import colmap_model, parts, programs, transforms

@@ -16,8 +16,8 @@ from plyfile import PlyData, PlyElement
 
 from splatmill.files import replacing
 from splatmill_worker.colmap import pycolmap, write_model
-from splatmill_worker.images.faces import joined
 from splatmill_worker.images.lens import PANORAMA, colmap_camera
+from splatmill_worker.images.panoramas.faces import joined
 from splatmill_worker.scene import Float, Scene, View
 from splatmill_worker.sfm.posed.transforms import OPENGL_TO_OPENCV
 

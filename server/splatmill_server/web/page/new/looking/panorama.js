@@ -1,5 +1,5 @@
-// Whether a photo is a panorama of 360 by 180 degrees, as the worker decides it (images/panoramas.py): by its XMP, or by
-// its shape and edges; a test compares them.
+// Whether a photo is a panorama of 360 by 180 degrees, as the worker decides it (images/panoramas/panoramas.py): by its XMP, or
+// by its shape and edges; a test compares them.
 
 /** Pixels of the reduced photo whose edges are compared. */
 export const SIZE = [512, 256];

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from splatmill_worker.images import faces
 from splatmill_worker.images.lens import PANORAMA
 from splatmill_worker.images.load import load_view, load_views
+from splatmill_worker.images.panoramas import faces
 from splatmill_worker.scene import Camera, Lens, PointViews, Scene, View
 from splatmill_worker.synthetic.ray_caster import picture
 from tests.support import panoramas

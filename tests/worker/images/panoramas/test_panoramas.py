@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from splatmill_worker.images import panoramas
-from splatmill_worker.images.panoramas import Candidate, Sphere, decided
+from splatmill_worker.images.panoramas import panoramas
+from splatmill_worker.images.panoramas.panoramas import Candidate, Sphere, decided
 from splatmill_worker.images.prepare import Prepared, prepare
 from tests.support.panoramas import gpano, striped, walk, write
 from tests.support.spherical_video import call_spherical

@@ -18,7 +18,7 @@ import numpy as np
 from PIL import Image, ImageCms
 
 from splatmill_worker.images import guarded
-from splatmill_worker.images.colors import (
+from splatmill_worker.images.colors.colors import (
     ADOBE_RGB,
     PRIMARIES,
     SRGB,

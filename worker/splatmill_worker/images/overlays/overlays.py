@@ -17,7 +17,7 @@ from splatmill_worker.images.copies import SMALL_SIDE, small_grey
 from splatmill_worker.images.decoding import decoders
 from splatmill_worker.images.load import training_size
 from splatmill_worker.images.masks import shown_part
-from splatmill_worker.images.overlay import MIN_PHOTOS, still
+from splatmill_worker.images.overlays.overlay import MIN_PHOTOS, still
 from splatmill_worker.scene import MIN_SHOWN, Overlay, Scene
 
 Region = npt.NDArray[np.bool_]

@@ -23,9 +23,9 @@ from PIL import Image, ImageCms
 
 from splatmill_worker.errors import UnusablePicture
 from splatmill_worker.images import decode, examine
-from splatmill_worker.images.colors import ADOBE_RGB, Colors, _rgb_to_xyz, _to_srgb, srgb
+from splatmill_worker.images.colors.colors import ADOBE_RGB, Colors, _rgb_to_xyz, _to_srgb, srgb
+from splatmill_worker.images.colors.photo_colors import PhotoColors
 from splatmill_worker.images.decoding import decoders
-from splatmill_worker.images.photo_colors import PhotoColors
 from splatmill_worker.images.prepare import prepare
 from splatmill_worker.sfm import posed
 from tests.worker.images.video.test_video_frame import (

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageDraw
 
-from splatmill_worker.images.overlay import MIN_PHOTOS
+from splatmill_worker.images.overlays.overlay import MIN_PHOTOS
 from splatmill_worker.images.prepare import Prepared, prepare
 from splatmill_worker.synthetic import look_at, orbit, photograph, still_life
 

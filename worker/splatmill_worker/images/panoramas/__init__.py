@@ -1,0 +1,1 @@
+"""Photos that show all directions: which these are, and their division into faces."""
