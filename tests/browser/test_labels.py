@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import pytest
 from playwright.sync_api import Locator, Page, expect
 
-from splatmill.schema.resources.labels import MOST_TAGS
+from splatmill.schema.resources.jobs.labels import MOST_TAGS
 from tests.browser.conftest import Open, SmallModel
 from tests.support.axe import violations
 from tests.support.up import Up

@@ -120,35 +120,6 @@ if TYPE_CHECKING:
         Role,
         may_be_empty,
     )
-    from splatmill.schema.resources.conversions import (
-        CONVERSION_HEADER,
-        CONVERSION_VERSION,
-        ComparedWith,
-        Conversion,
-        ConversionRequest,
-        ModelDownload,
-        ModelDownloads,
-    )
-    from splatmill.schema.resources.edits import EDIT_HEADER, Box, Edited, EditedView, EditModel
-    from splatmill.schema.resources.estimates import Estimate, EstimateJob, StageEstimate
-    from splatmill.schema.resources.events import (
-        EVENT,
-        FINAL_STATES,
-        CamerasEvent,
-        Curve,
-        CurveRow,
-        Event,
-        EventRecord,
-        JobState,
-        LogEvent,
-        MetricEvent,
-        PlanEvent,
-        PreviewEvent,
-        Progress,
-        ProgressEvent,
-        SnapshotEvent,
-        StateEvent,
-    )
     from splatmill.schema.resources.imports import (
         CreateImport,
         Import,
@@ -167,7 +138,26 @@ if TYPE_CHECKING:
         Unread,
         WorkerInfo,
     )
-    from splatmill.schema.resources.jobs import (
+    from splatmill.schema.resources.jobs.estimates import Estimate, EstimateJob, StageEstimate
+    from splatmill.schema.resources.jobs.events import (
+        EVENT,
+        FINAL_STATES,
+        CamerasEvent,
+        Curve,
+        CurveRow,
+        Event,
+        EventRecord,
+        JobState,
+        LogEvent,
+        MetricEvent,
+        PlanEvent,
+        PreviewEvent,
+        Progress,
+        ProgressEvent,
+        SnapshotEvent,
+        StateEvent,
+    )
+    from splatmill.schema.resources.jobs.jobs import (
         IDEMPOTENCY_HEADER,
         CreateJob,
         Job,
@@ -175,17 +165,27 @@ if TYPE_CHECKING:
         LogLine,
         LogPage,
     )
-    from splatmill.schema.resources.kept import Kept, KeptState
-    from splatmill.schema.resources.labels import ChangeLabels
-    from splatmill.schema.resources.live import (
+    from splatmill.schema.resources.jobs.labels import ChangeLabels
+    from splatmill.schema.resources.jobs.live import (
         SNAPSHOT_MEDIA_TYPE,
         PlacedCamera,
         Placement,
         UnusedPhoto,
         Watch,
     )
-    from splatmill.schema.resources.meshes import Mesh, MeshFacts, MeshFormat, MeshList, MeshRequest
-    from splatmill.schema.resources.models import (
+    from splatmill.schema.resources.models.conversions import (
+        CONVERSION_HEADER,
+        CONVERSION_VERSION,
+        ComparedWith,
+        Conversion,
+        ConversionRequest,
+        ModelDownload,
+        ModelDownloads,
+    )
+    from splatmill.schema.resources.models.edits import EDIT_HEADER, Box, Edited, EditedView, EditModel
+    from splatmill.schema.resources.models.kept import Kept, KeptState
+    from splatmill.schema.resources.models.meshes import Mesh, MeshFacts, MeshFormat, MeshList, MeshRequest
+    from splatmill.schema.resources.models.models import (
         HELD_OUT,
         TIME_LAPSE,
         Model,
@@ -197,13 +197,13 @@ if TYPE_CHECKING:
         Report,
         StageSeconds,
     )
-    from splatmill.schema.resources.orbits import (
+    from splatmill.schema.resources.models.orbits import (
         JoinOrbit,
         Orbit,
         OrbitFrames,
         OrbitList,
     )
-    from splatmill.schema.resources.presentation import (
+    from splatmill.schema.resources.models.presentation import (
         MOST_MARKS,
         POSTER,
         Annotation,
@@ -212,7 +212,7 @@ if TYPE_CHECKING:
         Presentation,
         Scale,
     )
-    from splatmill.schema.resources.selections import Selection, Stroke
+    from splatmill.schema.resources.models.selections import Selection, Stroke
     from splatmill.schema.resources.shares import (
         LONGEST_SHARE,
         CreateShare,

@@ -7,7 +7,7 @@ from concurrent.futures import Future
 from queue import SimpleQueue
 from typing import Any, Final, TypeVar
 
-from splatmill.schema.resources.events import Progress
+from splatmill.schema.resources.jobs.events import Progress
 
 T = TypeVar("T")
 

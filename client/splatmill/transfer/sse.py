@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from splatmill.errors import Unavailable
 from splatmill.schema.headers import read_token
-from splatmill.schema.resources.events import EventRecord
+from splatmill.schema.resources.jobs.events import EventRecord
 from splatmill.transfer.connection import LONGEST_WISH, Connection, backoff
 
 GIVE_UP_SECONDS = 300.0

@@ -13,7 +13,7 @@ from urllib.parse import quote
 from splatmill.errors import InvalidRequest, NothingToUpload, SplatmillError
 from splatmill.schema.problems import Problem
 from splatmill.schema.resources.captures import SHA256_HEADER, CaptureFile, Role
-from splatmill.schema.resources.events import Progress
+from splatmill.schema.resources.jobs.events import Progress
 from splatmill.transfer.chunked_uploads import PIECE, OnPosition, read_range, send_in_pieces
 from splatmill.transfer.connection import Connection, read_answer
 from splatmill.transfer.local_capture import LocalFile

@@ -19,7 +19,7 @@ from splatmill.backplane.storage.records import FORMAT, UnreadableRecord, check_
 from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import Job, Response
 from splatmill.schema.base import Label
-from splatmill.schema.resources.labels import Tags
+from splatmill.schema.resources.jobs.labels import Tags
 
 Labelled = TypeVar("Labelled", Job, JobRow)
 

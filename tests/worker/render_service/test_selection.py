@@ -13,7 +13,7 @@ import pytest
 from pydantic import ValidationError
 
 from splatmill.schema import CameraSpec, EditModel, Selection, Stroke
-from splatmill.schema.resources.selections import MOST_POINTS, MOST_STROKES
+from splatmill.schema.resources.models.selections import MOST_POINTS, MOST_STROKES
 from splatmill_worker.render_service.edit import kept
 from splatmill_worker.render_service.selection import selected, within
 from splatmill_worker.splat.formats import ply

@@ -6,7 +6,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Protocol, Self
 
 from splatmill.schema.quantities import format_bytes, format_duration
-from splatmill.schema.resources.events import (
+from splatmill.schema.resources.jobs.events import (
     EventRecord,
     JobState,
     LogEvent,

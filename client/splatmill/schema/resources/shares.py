@@ -3,7 +3,7 @@
 from pydantic import Field
 
 from splatmill.schema.base import Duration, Label, Measured, Request, Response, Time
-from splatmill.schema.resources.models import ModelFile
+from splatmill.schema.resources.models.models import ModelFile
 
 LONGEST_SHARE = 3650 * 86400.0
 """Seconds for which a link may be valid."""

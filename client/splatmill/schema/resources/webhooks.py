@@ -6,7 +6,7 @@ from pydantic import Field
 
 from splatmill.schema.base import Label, Request, Response, Time
 from splatmill.schema.resources.access import DEFAULT_OWNER, Owner
-from splatmill.schema.resources.jobs import Job
+from splatmill.schema.resources.jobs.jobs import Job
 
 
 class WebhookEvent(StrEnum):

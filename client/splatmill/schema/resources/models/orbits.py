@@ -6,7 +6,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from splatmill.schema.base import Request, Response
 from splatmill.schema.ids import ID
-from splatmill.schema.resources.kept import Kept, known
+from splatmill.schema.resources.models.kept import Kept, known
 from splatmill.schema.videos import OrbitRequest
 
 

@@ -8,7 +8,7 @@ from pydantic import ConfigDict, Field
 from splatmill.schema.base import Measured, Response, Time
 from splatmill.schema.cameras import CameraSpec
 from splatmill.schema.resources.access import DEFAULT_OWNER, Owner
-from splatmill.schema.resources.events import CurveRow
+from splatmill.schema.resources.jobs.events import CurveRow
 
 HELD_OUT = "held_out"
 """Folder of a model's held-out photos as they were compared, `000.webp` and so on."""

@@ -5,7 +5,7 @@ from typing import Annotated, Self
 from pydantic import Field, model_validator
 
 from splatmill.schema.base import Label, Measured, Request, Response
-from splatmill.schema.resources.selections import Selection
+from splatmill.schema.resources.models.selections import Selection
 
 EDIT_HEADER = "Splatmill-Edit"
 """Response header of the renderer with an edited model: the `Edited` of it, as JSON."""

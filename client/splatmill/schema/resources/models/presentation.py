@@ -6,7 +6,7 @@ from pydantic import AfterValidator, Field
 
 from splatmill.schema.base import Label, Request, Response, without_controls
 from splatmill.schema.cameras import CameraSpec
-from splatmill.schema.resources.edits import Point
+from splatmill.schema.resources.models.edits import Point
 from splatmill.schema.videos import CameraPath
 
 POSTER = "poster.jpg"

@@ -8,7 +8,7 @@ from splatmill.schema.base import Label, Request, Response, Time
 from splatmill.schema.options import TrainOptions
 from splatmill.schema.problems import Problem
 from splatmill.schema.resources.access import DEFAULT_OWNER, Owner
-from splatmill.schema.resources.events import JobState, LogEvent, Progress
+from splatmill.schema.resources.jobs.events import JobState, LogEvent, Progress
 from splatmill.schema.tolerant import keep_readable
 
 IDEMPOTENCY_HEADER = "Idempotency-Key"

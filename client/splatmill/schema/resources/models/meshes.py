@@ -6,9 +6,9 @@ from typing import Annotated, Self
 from pydantic import BeforeValidator, Field, model_validator
 
 from splatmill.schema.base import Request, Response
-from splatmill.schema.resources.edits import Box
-from splatmill.schema.resources.events import Progress
-from splatmill.schema.resources.kept import Kept, known
+from splatmill.schema.resources.jobs.events import Progress
+from splatmill.schema.resources.models.edits import Box
+from splatmill.schema.resources.models.kept import Kept, known
 
 
 class MeshFormat(StrEnum):

@@ -1,0 +1,1 @@
+"""Models: their records, and what is made of them."""
