@@ -19,7 +19,7 @@ import pytest
 
 from splatmill.backplane.storage import layout
 from splatmill.cli.app import COMMANDS
-from splatmill.cli.commands.models import FILES, OPTIONAL_FILES
+from splatmill.cli.commands.models.models import FILES, OPTIONAL_FILES
 from splatmill.cli.display.follow import ONE_SIGNAL_SECONDS
 from splatmill.cli.exits import Exit
 from splatmill.schema import (

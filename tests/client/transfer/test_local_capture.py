@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from splatmill.cli.commands.models import FILES, OPTIONAL_FILES
+from splatmill.cli.commands.models.models import FILES, OPTIONAL_FILES
 from splatmill.data_sets import find_cameras, walk
 from splatmill.errors import NothingToUpload
 from splatmill.schema import OUTPUT_MARKS, OUTPUT_MEDIA, Role, safe_name

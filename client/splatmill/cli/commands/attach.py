@@ -36,7 +36,7 @@ def follow(
     server: ServerOption = None,
 ) -> None:
     """Show the progress of a job until it ends, from its beginning. Ctrl-C ends this command and not the job."""
-    from splatmill.cli.commands.models import download_files, print_summary
+    from splatmill.cli.commands.models.models import download_files, print_summary
     from splatmill.cli.exits import Exit
     from splatmill.errors import JobCancelled
 

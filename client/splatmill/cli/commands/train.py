@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from splatmill.cli.commands.mesh import write_mesh
-from splatmill.cli.commands.models import download_files, print_summary, write_novel_view
+from splatmill.cli.commands.models.mesh import write_mesh
+from splatmill.cli.commands.models.models import download_files, print_summary, write_novel_view
 from splatmill.cli.display.follow import Interrupted, StoppedWaiting, follow_job
 from splatmill.cli.display.progress import make_display
 from splatmill.cli.exits import Exit

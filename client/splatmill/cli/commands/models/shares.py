@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from splatmill.cli.commands.models import ModelId
+from splatmill.cli.commands.models.models import ModelId
 from splatmill.cli.servers import ServerOption, open_client
 
 shares = typer.Typer(

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from splatmill.cli.commands.models import ModelId
+from splatmill.cli.commands.models.models import ModelId
 from splatmill.cli.display.tables import JsonRecord
 from splatmill.cli.servers import ServerOption, open_client
 

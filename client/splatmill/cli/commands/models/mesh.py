@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
-from splatmill.cli.commands.pictures import ModelOrFile, Up
+from splatmill.cli.commands.models.pictures import ModelOrFile, Up
 from splatmill.cli.local.local_model import is_local
 from splatmill.cli.local.programs import exec_module, require
 from splatmill.cli.servers import ServerOption, open_client

@@ -1,0 +1,1 @@
+"""The commands of models: their files, pictures, meshes, cameras, edits and links."""
