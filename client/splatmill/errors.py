@@ -183,8 +183,10 @@ def invalid_request(error: "ValidationError", code: str = "invalid_request") -> 
         message = entry["msg"].removeprefix("Value error, ")
         if entry["type"] == "extra_forbidden":
             clauses.append(f"there is no option {place!r}")
+        elif entry["type"] == "conflict":  # the sentence names both options, each of which has it
+            clauses.append(message.removesuffix("."))
         else:
             value = f" (got {entry['input']!r})" if isinstance(entry["input"], str | int | float) else ""
             clauses.append(f"{place}: {message}{value}" if place else message)
-    text = "; ".join(clauses).removesuffix(".")
+    text = "; ".join(dict.fromkeys(clauses)).removesuffix(".")
     return InvalidRequest(Problem.of(code, f"{text}."))

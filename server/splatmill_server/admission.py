@@ -5,7 +5,6 @@ checked in the transaction that inserts the job: that nothing it needs is being 
 its owner has.
 """
 
-import math
 from collections.abc import Sequence
 from contextlib import nullcontext
 from typing import cast
@@ -29,7 +28,7 @@ from splatmill.schema.files.formats import is_start_file
 from splatmill_server.access.caller import Caller
 from splatmill_server.base.problems import ProblemError
 from splatmill_server.captures.records import Captures
-from splatmill_server.jobs.estimate import least_within
+from splatmill_server.jobs.estimate import check_time
 from splatmill_server.jobs.finished import Finished
 from splatmill_server.jobs.records import Jobs, job_not_found
 from splatmill_server.models import Models
@@ -154,17 +153,7 @@ class Admission:
             )
         if options.within is not None and photos:
             request = EstimateJob(photos=len(images), posed=posed, options=options)
-            recovered = next(iter(self.storage.walk(layout.capture_sfm(capture_id))), None) is not None
-            least = least_within(request, self.finished.newest(), recovered=recovered)
-            if least is not None and options.within < least:
-                raise ProblemError(
-                    "option_out_of_range",
-                    f"within is {options.within:g} s; the fastest of the jobs that have finished here and are most "
-                    f"alike would take {least:.0f} s for the cameras of {len(images)} photos, one step on each, and "
-                    "the files.",
-                    advice=f"Set within to {math.ceil(least)} s or more, or give fewer photos.",
-                    facts={"images": len(images)},
-                )
+            check_time(request, self.finished.newest(), recovered=self.captures.has_cameras(capture_id))
 
     def _check_start(self, who: Caller, request: CreateJob) -> None:
         """Raise a problem if the model to start from, where the request names one, is not there for the caller."""

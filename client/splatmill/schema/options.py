@@ -5,13 +5,14 @@
 
 from enum import StrEnum
 from types import NoneType
-from typing import Any, Literal, get_args
+from typing import Any, Literal, Self, get_args
 
 from annotated_types import Ge, Le, MaxLen, MinLen
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 from pydantic.fields import FieldInfo
 
 from splatmill.schema.base import ByteSize, Duration, Request, Response, without_controls
+from splatmill.schema.conflicts import check_conflicts
 from splatmill.schema.files.formats import is_start_file, start_suffixes
 from splatmill.schema.files.names import safe_name
 from splatmill.schema.frames import known_distance
@@ -119,8 +120,8 @@ class TrainOptions(Request):
         ge=1,
         le=1_000_000,
         description=(
-            "Number of training steps. Left out, the time budget or else the preset sets the length of the "
-            "training."
+            "Number of training steps. With a time beside it, training ends by whichever is reached first. Left out, "
+            "the time or else the preset sets the length of the training."
         ),
         json_schema_extra=_BUDGET,
     )
@@ -413,6 +414,11 @@ class TrainOptions(Request):
         if scale is not None:
             known_distance(without_controls(scale))
         return scale
+
+    @model_validator(mode="after")
+    def _compatible(self) -> Self:
+        check_conflicts(vars(self))
+        return self
 
     @property
     def ending(self) -> Preset:

@@ -280,15 +280,26 @@ class AsyncClient:
         return read_answer(OptionList, response).options
 
     async def estimate(
-        self, photos: int, options: TrainOptions | None = None, *, posed: bool = False
+        self,
+        photos: int,
+        options: TrainOptions | None = None,
+        *,
+        posed: bool = False,
+        exact: bool = True,
+        capture: str | None = None,
     ) -> Estimate:
         """Return how long a job on `photos` photos would take, derived from the jobs that the server has finished.
 
-        `posed` states that the cameras come with the photos. Nothing is created. Raises InvalidRequest for options that
-        the server does not accept.
+        `posed` states that the cameras come with the photos, and `exact` that their number is certain, as it is not for
+        a video. `capture` is the id of the capture that holds them, whose cameras may be known. Nothing is created.
+        Raises InvalidRequest for options that the server does not accept, and NotFound for a capture that it has not.
         """
         chosen = options.model_dump(mode="json", exclude_unset=True) if options is not None else {}
-        body = {"photos": photos, "posed": posed, "options": chosen}
+        body: dict[str, Any] = {"photos": photos, "posed": posed, "options": chosen}
+        if not exact:
+            body["exact"] = False
+        if capture is not None:
+            body["capture"] = capture
         response = await self.connection.request("POST", "/v1/estimate", json=body, repeatable=True)
         return read_answer(Estimate, response)
 

@@ -543,13 +543,24 @@ class Client:
         """Return the training options of the server, with type, default, range and help."""
         return self._loop.run(self._async.options())
 
-    def estimate(self, photos: int, options: TrainOptions | None = None, *, posed: bool = False) -> Estimate:
+    def estimate(
+        self,
+        photos: int,
+        options: TrainOptions | None = None,
+        *,
+        posed: bool = False,
+        exact: bool = True,
+        capture: str | None = None,
+    ) -> Estimate:
         """Return how long a job on `photos` photos would take, derived from the jobs that the server has finished.
 
-        `posed` states that the cameras come with the photos. Nothing is created. Raises InvalidRequest for options that
-        the server does not accept.
+        `posed` states that the cameras come with the photos, and `exact` that their number is certain, as it is not for
+        a video. `capture` is the id of the capture that holds them, whose cameras may be known. Nothing is created.
+        Raises InvalidRequest for options that the server does not accept, and NotFound for a capture that it has not.
         """
-        return self._loop.run(self._async.estimate(photos, options, posed=posed))
+        return self._loop.run(
+            self._async.estimate(photos, options, posed=posed, exact=exact, capture=capture)
+        )
 
     def me(self) -> Me:
         """Return who the server takes the caller for: owner, scopes, limits and their use."""

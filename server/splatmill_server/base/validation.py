@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from splatmill.schema import MAX_RENDER_PIXELS, MAX_RENDER_SIDE, Problem, TrainOptions
+from splatmill.schema.conflicts import CONFLICT
 
 _RANGE = {"greater_than", "greater_than_equal", "less_than", "less_than_equal", "enum", "literal_error"}
 _RANGE |= {"too_short", "too_long", "finite_number", "multiple_of"}
@@ -42,6 +43,8 @@ def _named(error: Any) -> tuple[str, str, str | None] | None:
                 f"There is no option {field!r}.",
                 advice or "List the options with GET /v1/options.",
             )
+        if kind == CONFLICT:
+            return "option_out_of_range", _sentence(error), None
         if kind in _RANGE:
             detail = f"The option {loc[1]!r} cannot be {_short(value)}: {_sentence(error)}"
             return "option_out_of_range", detail, "List the accepted values with GET /v1/options."

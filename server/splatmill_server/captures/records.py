@@ -154,6 +154,10 @@ class Captures:
         if not who.may_see(owner):
             raise capture_not_found(capture_id)
 
+    def has_cameras(self, capture_id: str) -> bool:
+        """Return whether an earlier job has recovered the cameras of a capture, or a part of them."""
+        return next(iter(self.storage.walk(layout.capture_sfm(capture_id))), None) is not None
+
     async def get_with_files(self, capture_id: str) -> Capture:
         """Return the record with all files and their digests. Raises a 404 problem."""
         capture = await run_in_threadpool(self.get, capture_id)

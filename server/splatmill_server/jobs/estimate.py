@@ -16,6 +16,7 @@ from splatmill.schema import (
     TrainOptions,
     preset_steps,
 )
+from splatmill_server.base.problems import ProblemError
 from splatmill_server.jobs.finished import Figures
 
 ALIKE = 5
@@ -61,6 +62,25 @@ def least_within(request: EstimateJob, finished: Sequence[Figures], *, recovered
     once = request.options.model_copy(update={"steps": request.photos, "time_budget": None, "within": None})
     stages = estimate(request.model_copy(update={"options": once}), finished).stages
     return _sum([stage.lowest for stage in stages if not (recovered and stage.stage == "cameras")], None)
+
+
+def check_time(request: EstimateJob, finished: Sequence[Figures], *, recovered: bool) -> None:
+    """Raise a 422 problem if the time for the whole job is too short for so many photos; arguments as above."""
+    within = request.options.within
+    least = None if within is None else least_within(request, finished, recovered=recovered)
+    if within is None or least is None or within >= least:
+        return
+    fastest = (
+        f"he fastest of the jobs that have finished here and are most alike would take {least:.0f} s for the cameras of "
+        f"{request.photos} photos, one step on each, and the files."
+    )
+    detail = f"within is {within:g} s; t{fastest}"
+    advice = f"Set within to {math.ceil(least)} s or more, or give fewer photos."
+    what = f"T{fastest} Give {math.ceil(least)} s or more, or fewer photos."
+    error = {"where": "options.within", "what": what, "given": f"{within:g}"}
+    raise ProblemError(
+        "option_out_of_range", detail, advice=advice, facts={"images": request.photos, "errors": [error]}
+    )
 
 
 def _cameras(request: EstimateJob, here: Sequence[Figures]) -> StageEstimate:

@@ -13,6 +13,7 @@ from splatmill.backplane import lists
 from splatmill.backplane.jobs.row import now
 from splatmill.backplane.storage import layout
 from splatmill.schema import EstimateJob, TrainOptions
+from splatmill.schema.conflicts import CONFLICTS
 from splatmill_server.jobs.estimate import estimate, least_within
 from splatmill_server.jobs.finished import Figures, figures
 from tests.support.facts import changed, planned
@@ -131,13 +132,37 @@ def test_a_job_that_cannot_end_in_its_time_is_refused_with_the_least_time(app: S
     advice = problem(app.http.post("/v1/jobs", json=body), 422, "option_out_of_range")["advice"]
     least = int(re.findall(r"within to (\d+) s", advice)[0])
     assert least > 20 / 8 * 30.5
+    # The estimate, which is asked before photos are sent, refuses it likewise.
+    asked: dict[str, Any] = {"photos": 20, "options": body["options"]}
+    refused = problem(app.http.post("/v1/estimate", json=asked), 422, "option_out_of_range")
+    assert refused["advice"] == advice
+    assert [error["where"] for error in refused["facts"]["errors"]] == ["options.within"]
+    assert f"Give {least} s or more" in refused["facts"]["errors"][0]["what"]
+    assert app.http.post("/v1/estimate", json=asked | {"exact": False}).status_code == 200  # a video
+    assert app.http.post("/v1/estimate", json=asked | {"options": {"within": least}}).status_code == 200
     for seconds, status in ((least - 1, 422), (least, 202)):
         body["options"] = {"within": seconds}
         assert app.http.post("/v1/jobs", json=body).status_code == status
     # The cameras of this capture are there now.
     app.service.storage.put(f"{layout.capture_sfm(capture)}/model/cameras.bin", b"cameras")
-    body["options"] = {"within": round(least - 20 / 8 * 30.5) + 1}
+    body["options"] = asked["options"] = {"within": round(least - 20 / 8 * 30.5) + 1}
+    assert app.http.post("/v1/estimate", json=asked).status_code == 422
+    assert app.http.post("/v1/estimate", json=asked | {"capture": capture}).status_code == 200
+    problem(app.http.post("/v1/estimate", json=asked | {"capture": "f" * 16}), 404, "capture_not_found")
     assert app.http.post("/v1/jobs", json=body).status_code == 202
+
+
+@pytest.mark.parametrize("address", ["/v1/estimate", "/v1/jobs"])
+def test_options_that_exclude_each_other_are_refused_with_an_error_for_each(
+    app: ServedApp, address: str
+) -> None:
+    options = {"pose_refinement": "on", "cluster_culling": "on", "backend": "gpu"}
+    body = {"options": options} | ({"photos": 20} if "estimate" in address else {"capture": "f" * 16})
+    refused = problem(app.http.post(address, json=body), 422, "option_out_of_range")
+    assert refused["detail"] == CONFLICTS[0].reason
+    assert [(error["where"], error["what"]) for error in refused["facts"]["errors"]] == [
+        (f"options.{name}", conflict.reason) for conflict in CONFLICTS[:2] for name in conflict.names
+    ]
 
 
 def test_only_the_share_of_a_step_that_pixels_take_grows_with_them() -> None:

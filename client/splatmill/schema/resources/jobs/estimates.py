@@ -12,7 +12,20 @@ class EstimateJob(Request):
     """A request for the time that a job would take. Nothing is created."""
 
     photos: int = Field(ge=1, le=100_000, description="Number of photos, with those taken from videos.")
+    exact: bool = Field(
+        default=True,
+        description="Whether that number is certain, as it is for photos. The frames of a video, and the photos in an "
+        "archive, are counted in the course of the job. A time for the whole job that is too short for the photos is "
+        "refused where it is certain.",
+    )
     posed: bool = Field(default=False, description="Whether the cameras come with the photos.")
+    capture: str | None = Field(
+        default=None,
+        min_length=1,
+        max_length=64,
+        description="Id of the capture that holds the photos, where there is one: its cameras may be known from an "
+        "earlier job.",
+    )
     options: TrainOptions = Field(default_factory=TrainOptions)
 
 

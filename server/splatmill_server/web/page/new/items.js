@@ -183,21 +183,23 @@ export class Items {
   }
 
   /**
-   * How many photos a job will have, and whether cameras come with them.
+   * How many photos a job will have, whether their number is certain, and whether cameras come with them.
    * @param {Held[]} held files that the capture holds
    * @param {number} frames photos that are taken from a video
-   * @returns {{photos: number | null, posed: boolean}} null where an archive does not tell
+   * @returns {{photos: number | null, exact: boolean, posed: boolean}} `photos` is null where an archive does not tell
    */
   size(held, frames) {
     const items = this.used;
     const own = new Set(items.map((item) => `${item.role}/${item.name}`));
     const others = held.filter((file) => !own.has(`${file.role}/${file.name}`));
     let photos = 0;
+    let exact = true;
     const isPose = (/** @type {{role: string | null, name: string}} */ file) => holdsCameras(file, this.accepted);
     let posed = others.some(isPose) || items.some(isPose);
     let known = !others.some(({ role, name }) => role === "images" && (name === this.accepted.example || this.accepted.archives.includes(suffix(name))));
     for (const name of [...items, ...others].filter((file) => file.role === "images").map((file) => suffix(file.name))) {
       if (this.accepted.photos.includes(name)) photos++;
+      else exact = false;
       if (this.accepted.videos.includes(name)) photos += frames;
     }
     for (const { inside } of items.filter((item) => item.kind === "archive")) {
@@ -206,7 +208,7 @@ export class Items {
       photos += sorted.files.filter((file) => file.role === "images").length;
       posed ||= sorted.files.some(isPose);
     }
-    return { photos: known ? photos : null, posed };
+    return { photos: known ? photos : null, exact: exact && known && photos > 0, posed };
   }
 }
 

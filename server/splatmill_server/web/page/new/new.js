@@ -43,7 +43,7 @@ const form = new OptionsForm(options, estimateSoon);
 const gallery = new Gallery(byId("photos"), byId("others"), byId("more"), toggle);
 const looking = new Looking(onLooked);
 const overlap = new Overlap(redraw);
-const start = new Start(items, form, { redraw: () => redraw(), problem: refused });
+const start = new Start(items, form, { redraw: () => redraw(), problem: refused, job: () => job().body });
 
 byId("settings-first").append(form.first);
 byId("settings-all").append(form.all);
@@ -212,11 +212,16 @@ function estimateSoon() {
   estimating = setTimeout(() => void estimate(), ESTIMATE_AFTER);
 }
 
+/** The job that would be started, as the server estimates it; its photos are null where they cannot be counted here. */
+function job() {
+  const values = form.values();
+  const { photos, exact, posed } = items.size(start.held, Number(values.max_video_frames) || options.find((/** @type {any} */ one) => one.name === "max_video_frames").default);
+  return { photos, body: { photos: Math.max(1, photos ?? 1), exact, posed, capture: start.capture, options: values } };
+}
+
 async function estimate() {
   if (byId("go").hidden || start.busy) return;
-  const values = form.values();
-  const { photos, posed } = items.size(start.held, Number(values.max_video_frames) || options.find((/** @type {any} */ one) => one.name === "max_video_frames").default);
-  const body = { photos: Math.max(1, photos ?? 1), posed, options: values };
+  const { body, photos } = job();
   const question = JSON.stringify([body, photos, items.lacking]);
   if (question === asked) return;
   asked = question;
@@ -227,7 +232,7 @@ async function estimate() {
     showProblem(null);
     byId("estimate").replaceChildren(items.lacking ? h("p", { class: "error" }, items.lacking) : photos === null
       ? h("p", {}, "How long it will take is not known: the server has yet to count the photos in the archive.")
-      : estimateOf(estimate, photos, info.queued, values));
+      : estimateOf(estimate, photos, info.queued, body.options));
   } catch (error) {
     if (!(error instanceof Problem) || asked !== question) return;
     asked = "";

@@ -105,7 +105,7 @@ export class OptionsForm {
       const [root, name] = where.split(".");
       const field = root === "options" ? this.fields.get(name) : undefined;
       if (!field) return false;
-      field.error.textContent = what;
+      field.error.textContent = this.plain(what);
       for (const input of field.inputs) input.setAttribute("aria-invalid", "true");
       field.error.closest("details")?.setAttribute("open", "");
       return true;

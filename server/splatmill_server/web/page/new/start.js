@@ -19,6 +19,7 @@ export class Start {
    * @param {object} on
    * @param {() => void} on.redraw
    * @param {(problem: Error | null) => void} on.problem
+   * @param {() => unknown} on.job the job that would be started, as the server estimates it
    */
   constructor(items, form, on) {
     this.items = items;
@@ -149,7 +150,7 @@ export class Start {
 
   /** Let the server check the settings before anything is sent. */
   async check() {
-    await send("POST", "/v1/estimate", { photos: 1, options: this.form.values() });
+    await send("POST", "/v1/estimate", this.on.job());
   }
 
   /** Wait until all files have been looked at; their digests are needed. */
