@@ -6,8 +6,7 @@ They are read from storage, so each stays available while Redis is away; only li
 import json
 import re
 import zlib
-from collections.abc import Callable, Mapping, Sequence
-from math import inf
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pydantic import Field, ValidationError
@@ -22,10 +21,10 @@ from splatmill.schema import (
     ChangeLabels,
     Job,
     JobState,
+    ListOrder,
     Model,
     ModelCameras,
     ModelFile,
-    ModelOrder,
     ModelPage,
     Report,
     Response,
@@ -34,10 +33,10 @@ from splatmill.schema import (
 from splatmill_server.access.caller import Caller
 from splatmill_server.base.filters import Filter
 from splatmill_server.base.lists import Ended, Lists, each
-from splatmill_server.base.paging import read_cursor, write_cursor
 from splatmill_server.base.problems import ProblemError
 from splatmill_server.base.root_path import address
 from splatmill_server.jobs import labels as job_labels
+from splatmill_server.jobs.ranking import rank, ranked_page
 from splatmill_server.jobs.records import Jobs, read_model_record, read_record
 
 _HEADER_BYTES = 8192
@@ -49,16 +48,6 @@ _DEGREE = {0: 0, 9: 1, 24: 2, 45: 3}
 
 
 _LISTED_TOGETHER = 500
-
-
-SORTED = 5000
-"""Largest number of models of a list that is sorted by something else than their time: the records of all are read."""
-
-_RANKS: dict[ModelOrder, Callable[[Model], Any]] = {
-    ModelOrder.name: lambda model: (model.name is None, (model.name or "").casefold()),
-    ModelOrder.size: lambda model: -model.bytes,
-    ModelOrder.psnr: lambda model: inf if model.psnr is None else -model.psnr,
-}
 
 
 class _Labelled(Response):
@@ -182,40 +171,27 @@ class Models:
         cursor: str | None,
         limit: int,
         only: Filter | None = None,
-        order: ModelOrder = ModelOrder.newest,
+        order: ListOrder = ListOrder.newest,
     ) -> ModelPage:
-        """Return a page of the models that `only` admits. Raises the problems of `Lists.page`.
-
-        In an order other than the newest first, raises a 422 problem for a list of more than SORTED models.
-        """
+        """Return a page of the models that `only` admits. Raises the problems of `Lists.page` and `ranked_page`."""
         only = only or Filter()
         names = [lists.name("models", owner=only.owner)]
-        if order is not ModelOrder.newest:
-            return self._sorted(names, cursor, limit, only, order)
-        models, following = self.lists.page(
-            names, cursor, limit, lambda ids: self._listed(ids, only), narrowed=only.by_labels
-        )
+
+        def read(model_ids: Sequence[str]) -> dict[str, Model]:
+            return self._listed(model_ids, only)
+
+        def ranks(models: Mapping[str, Model]) -> dict[str, Any]:
+            return {name: rank(order, model.name, model) for name, model in models.items()}
+
+        if order is not ListOrder.newest:
+            models, following = ranked_page(self.lists, names, cursor, limit, order, read, ranks)
+        else:
+            models, following = self.lists.page(names, cursor, limit, read, narrowed=only.by_labels)
         return ModelPage(models=models, cursor=following)
 
-    def _sorted(
-        self, names: Sequence[str], cursor: str | None, limit: int, only: Filter, order: ModelOrder
-    ) -> ModelPage:
-        position, last = read_cursor(cursor) if cursor is not None else (0, "")
-        newest = self.lists.newest(names, None, SORTED + 1)
-        if len(newest) > SORTED:
-            raise ProblemError(
-                "list_too_long",
-                f"The list has more than {SORTED:,} models, which are not sorted by {order}.",
-                advice="List the newest first, or find models by their names and tags.",
-            )
-        ranked = sorted(self._listed([name for _, name in newest], only).values(), key=_RANKS[order])
-        # The page after a model that is no longer listed begins where that was.
-        gone = max(0, position - 1)
-        start = next((place + 1 for place, model in enumerate(ranked) if model.id == last), gone)
-        page, following = ranked[start : start + limit], None
-        if start + limit < len(ranked):
-            following = write_cursor(start + limit, page[-1].id)
-        return ModelPage(models=page, cursor=following)
+    def finished(self, model_ids: Sequence[str]) -> dict[str, Model]:
+        """Return those of these models that are finished and not in the bin, by id, without those that are corrupt."""
+        return self._listed(model_ids, Filter())
 
     def _listed(self, model_ids: Sequence[str], only: Filter) -> dict[str, Model]:
         """Return those of these models that `only` admits, by id. What was read of one is kept for lists."""

@@ -12,6 +12,7 @@ from playwright.sync_api import Locator, Page, expect
 
 from splatmill.schema.resources.jobs.labels import MOST_TAGS
 from tests.browser.conftest import Open, SmallModel
+from tests.browser.test_lists import cancelled_jobs
 from tests.support.axe import violations
 from tests.support.up import Up
 
@@ -116,6 +117,27 @@ def test_models_are_sorted(service: Up, library: dict[str, str], page: Page) -> 
     page.reload()
     expect(first).to_have_value("psnr")
     wait_for_names(page, best)
+
+
+def test_jobs_are_sorted_as_models_are(service: Up, model: SmallModel, page: Page) -> None:
+    ids = cancelled_jobs(service, model.capture, 2)
+    try:
+        page.goto("/jobs?name=s")
+        first = page.get_by_label("Sort by")
+        shown = page.locator("#list > li .whole")
+        expect(shown.first).to_have_text("series 01")
+        first.select_option("Name")
+        expect(shown.filter(has_text="series")).to_have_text(["series 00", "series 01"])
+        assert page.url.endswith("/jobs?name=s&sort=name")
+        for order in ("Largest first", "Highest dB first"):
+            first.select_option(order)
+            expect(shown.first).to_have_text("still life")  # the others have no model
+        page.reload()
+        expect(first).to_have_value("psnr")
+        expect(shown.first).to_have_text("still life")
+    finally:
+        for job_id in ids:
+            service.http.delete(f"/v1/jobs/{job_id}")
 
 
 def test_the_tag_field_knows_the_tags(service: Up, library: dict[str, str], page: Page) -> None:

@@ -119,10 +119,17 @@ def test_the_command_says_what_is_left_out(app: ServedApp) -> None:
     corners = ("--box", "0", "-2", "-2", "2", "2", "2")
     seen = invoke("edit", MODEL, *corners, "--preview", *at)
     assert (seen.exit_code, seen.stdout.count("\n")) == (0, 1), seen.output
-    assert " of 400 Gaussians would be left out. PSNR on 2 held-out photos: " in seen.stdout
+    assert seen.stdout.endswith(
+        " of 400 Gaussians would be left out. The photos show what is left out, so they do not measure what is left.\n"
+    )
     record = json.loads(invoke("edit", MODEL, *corners, "--preview", "--json", *at).stdout)
     assert f"{400 - record['gaussians']} of 400" in seen.stdout
-    assert f"{record['psnr_before']:.2f} dB before, {record['psnr']:.2f} dB after." in seen.stdout
+    assert record["crops"] is True
+    cleaned = invoke("edit", MODEL, "--min-opacity", "0.1", "--preview", *at)
+    assert " of 400 Gaussians would be left out. PSNR on 2 held-out photos: " in cleaned.stdout
+    clean = json.loads(invoke("edit", MODEL, "--min-opacity", "0.1", "--preview", "--json", *at).stdout)
+    assert clean["crops"] is False
+    assert f"{clean['psnr_before']:.2f} dB before, {clean['psnr']:.2f} dB after." in cleaned.stdout
     done = invoke("edit", MODEL, *corners, "--name", "half", *at)
     with Client(str(app.http.base_url)) as client:
         made = client.model(done.stdout.splitlines()[-1].removeprefix("model "))

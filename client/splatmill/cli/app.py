@@ -22,6 +22,7 @@ COMMANDS = {
     "cancel": ("splatmill.cli.commands.jobs", "cancel"),
     "restart": ("splatmill.cli.commands.jobs", "restart"),
     "rename": ("splatmill.cli.commands.jobs", "rename"),
+    "label": ("splatmill.cli.commands.jobs", "label"),
     "delete": ("splatmill.cli.commands.delete", "delete"),
     "bin": ("splatmill.cli.commands.bin", "bin_commands"),
     "models": ("splatmill.cli.commands.records", "models"),
@@ -47,7 +48,18 @@ COMMANDS = {
 # The commands under each heading of `splatmill --help`; those without one are under the last heading.
 HEADINGS = {
     "Make a model": ("train", "fit-image", "options"),
-    "Jobs on a server": ("jobs", "status", "follow", "logs", "cancel", "restart", "rename", "delete", "bin"),
+    "Jobs on a server": (
+        "jobs",
+        "status",
+        "follow",
+        "logs",
+        "cancel",
+        "restart",
+        "rename",
+        "label",
+        "delete",
+        "bin",
+    ),
     "Models and captures": (
         "models",
         "download",

@@ -165,7 +165,7 @@ if TYPE_CHECKING:
         LogLine,
         LogPage,
     )
-    from splatmill.schema.resources.jobs.labels import ChangeLabels
+    from splatmill.schema.resources.jobs.labels import ChangeLabels, ListOrder
     from splatmill.schema.resources.jobs.live import (
         SNAPSHOT_MEDIA_TYPE,
         PlacedCamera,
@@ -192,7 +192,6 @@ if TYPE_CHECKING:
         ModelCamera,
         ModelCameras,
         ModelFile,
-        ModelOrder,
         ModelPage,
         Report,
         StageSeconds,
@@ -357,6 +356,7 @@ __all__ = [
     "Lan",
     "LanAccess",
     "Limits",
+    "ListOrder",
     "LogEvent",
     "LogLine",
     "LogPage",
@@ -381,7 +381,6 @@ __all__ = [
     "ModelFile",
     "ModelFormat",
     "ModelFrame",
-    "ModelOrder",
     "ModelPage",
     "NewKeyLimits",
     "OptionHelp",

@@ -17,9 +17,9 @@ from splatmill.schema import (
     Job,
     JobPage,
     LanAccess,
+    ListOrder,
     Me,
     Model,
-    ModelOrder,
     ModelPage,
     OptionHelp,
     OptionList,
@@ -231,13 +231,15 @@ class AsyncClient:
         tag: str | None = None,
         favourite: bool | None = None,
         capture: str | None = None,
+        sort: ListOrder | str = ListOrder.newest,
         owner: str | None = None,
     ) -> AsyncIterator[Job]:
-        """Yield the jobs, newest first, at most `limit` of them.
+        """Yield the jobs, at most `limit` of them.
 
         `state` chooses those in this state, or one of several. `name` chooses those whose name contains this text, and
         `tag` those with this tag, in any case of letters; `favourite` those with a star, or without one; `capture`
-        those on the capture with this id, and `owner` those of one owner, for callers with the scope admin. Pages are
+        those on the capture with this id, and `owner` those of one owner, for callers with the scope admin. `sort` is
+        what comes first: newest, name, or the size or psnr of the model; jobs without one come last. Pages are
         requested as needed.
         """
         states = [state] if isinstance(state, str) else list(state or ())
@@ -247,6 +249,7 @@ class AsyncClient:
             "tag": tag,
             "favourite": favourite,
             "capture": capture,
+            "sort": str(sort),
             "owner": owner,
         }
         return self._entries(JobPage, "/v1/jobs", lambda page: page.jobs, limit, filters)
@@ -262,7 +265,7 @@ class AsyncClient:
         name: str | None = None,
         tag: str | None = None,
         favourite: bool | None = None,
-        sort: ModelOrder | str = ModelOrder.newest,
+        sort: ListOrder | str = ListOrder.newest,
         owner: str | None = None,
     ) -> AsyncIterator[Model]:
         """Yield the finished models, at most `limit` of them.

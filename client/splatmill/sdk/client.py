@@ -21,12 +21,12 @@ from splatmill.schema import (
     Job,
     JobState,
     LanAccess,
+    ListOrder,
     LogLine,
     Me,
     Model,
     ModelCamera,
     ModelDownload,
-    ModelOrder,
     OptionHelp,
     Placement,
     Presentation,
@@ -494,13 +494,15 @@ class Client:
         tag: str | None = None,
         favourite: bool | None = None,
         capture: str | None = None,
+        sort: ListOrder | str = ListOrder.newest,
         owner: str | None = None,
     ) -> Iterator[Job]:
-        """Yield the jobs, newest first, at most `limit` of them.
+        """Yield the jobs, at most `limit` of them.
 
         `state` chooses those in this state, or one of several. `name` chooses those whose name contains this text, and
         `tag` those with this tag, in any case of letters; `favourite` those with a star, or without one; `capture`
-        those on the capture with this id, and `owner` those of one owner, for callers with the scope admin. Pages are
+        those on the capture with this id, and `owner` those of one owner, for callers with the scope admin. `sort` is
+        what comes first: newest, name, or the size or psnr of the model; jobs without one come last. Pages are
         requested as needed.
         """
         return self._loop.iterate(
@@ -511,6 +513,7 @@ class Client:
                 tag=tag,
                 favourite=favourite,
                 capture=capture,
+                sort=sort,
                 owner=owner,
             )
         )
@@ -526,7 +529,7 @@ class Client:
         name: str | None = None,
         tag: str | None = None,
         favourite: bool | None = None,
-        sort: ModelOrder | str = ModelOrder.newest,
+        sort: ListOrder | str = ListOrder.newest,
         owner: str | None = None,
     ) -> Iterator[Model]:
         """Yield the finished models, at most `limit` of them.

@@ -71,8 +71,8 @@ def check_time(request: EstimateJob, finished: Sequence[Figures], *, recovered: 
     if within is None or least is None or within >= least:
         return
     fastest = (
-        f"he fastest of the jobs that have finished here and are most alike would take {least:.0f} s for the cameras of "
-        f"{request.photos} photos, one step on each, and the files."
+        f"he fastest of the jobs that have finished here and are most alike would take {least:.0f} s for the "
+        f"cameras of {request.photos} photos, one step on each, and the files."
     )
     detail = f"within is {within:g} s; t{fastest}"
     advice = f"Set within to {math.ceil(least)} s or more, or give fewer photos."

@@ -1,18 +1,33 @@
 """Pages of the list of jobs: the list that is asked for, and which of its jobs belong to the page."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from string import Template
-from typing import cast
+from typing import Any, NamedTuple, cast
 
 import redis
 
 from splatmill.backplane import keys, lists
-from splatmill.schema import JobPage
+from splatmill.schema import JobPage, ListOrder, Model
 from splatmill_server.base.filters import JobFilter
 from splatmill_server.base.lists import Lists
 from splatmill_server.jobs.links import with_links
 from splatmill_server.jobs.queue_places import QueuePlaces
+from splatmill_server.jobs.ranking import rank, ranked_page
 from splatmill_server.jobs.reading import Held, read_jobs
+
+
+class By(NamedTuple):
+    """What a list of jobs is ordered by.
+
+    models: returns the finished models of jobs with these ids, by id, which have the size and the PSNR.
+    """
+
+    order: ListOrder
+    models: Callable[[Sequence[str]], Mapping[str, Model]]
+
+
+NEWEST = By(ListOrder.newest, lambda _: {})
+"""The newest jobs first."""
 
 # ARGV: number of states, states, jobs. For each job: whether it may be in one of the states (in any, if none is given),
 # and the fields of its row. A verdict and a restart say more than the states do, so that such jobs are always likely.
@@ -51,8 +66,9 @@ def page(
     cursor: str | None,
     limit: int,
     only: JobFilter,
+    by: By,
 ) -> JobPage:
-    """Return a page of the jobs that `only` admits, newest first. Raises the problems of `Lists.page`."""
+    """Return a page of the jobs that `only` admits. Raises the problems of `Lists.page` and `ranked_page`."""
 
     def likely(job_ids: Sequence[str]) -> list[str]:
         return _likely(connection, job_ids, only)
@@ -66,10 +82,20 @@ def page(
             and (only.states is None or held_job.state in only.states)
         }
 
+    def admitted(job_ids: Sequence[str]) -> Mapping[str, Held]:
+        return read(likely(job_ids) if narrowed else job_ids)
+
+    def ranks(held: Mapping[str, Held]) -> dict[str, Any]:
+        made = {} if by.order is ListOrder.name else by.models(list(held))
+        return {job_id: rank(by.order, job.row.name, made.get(job_id)) for job_id, job in held.items()}
+
     narrowed = only.by_labels or only.states is not None
-    held_jobs, following = listed.page(
-        _lists(only), cursor, limit, read, narrowed=narrowed, likely=likely if narrowed else None
-    )
+    if by.order is not ListOrder.newest:
+        held_jobs, following = ranked_page(listed, _lists(only), cursor, limit, by.order, admitted, ranks)
+    else:
+        held_jobs, following = listed.page(
+            _lists(only), cursor, limit, read, narrowed=narrowed, likely=likely if narrowed else None
+        )
     jobs = [(with_links(held.job()), held.row.generation) for held in held_jobs]
     return JobPage(jobs=places.fill(jobs), cursor=following)
 

@@ -206,9 +206,12 @@ class Jobs:
         ended = job_log.get_stored_end(self.storage, job_id)
         return with_links(ended.job) if ended is not None else None
 
-    def list(self, cursor: str | None, limit: int, only: JobFilter | None = None) -> JobPage:
-        """Return a page of the jobs that `only` admits, newest first (see `Lists.page`)."""
-        return listing.page(self.connection, self.lists, self._places, cursor, limit, only or JobFilter())
+    def list(
+        self, cursor: str | None, limit: int, only: JobFilter | None = None, by: listing.By = listing.NEWEST
+    ) -> JobPage:
+        """Return a page of the jobs that `only` admits, in the order `by` (see `listing.page`)."""
+        only = only or JobFilter()
+        return listing.page(self.connection, self.lists, self._places, cursor, limit, only, by)
 
     def make_lists(self, succeeded: dict[str, Ended]) -> int:
         """List all jobs, restore those that storage alone knows, and return their number (see `Lists.makers`)."""

@@ -4,6 +4,7 @@ from typing import Annotated, Any
 
 from fastapi import Depends, Query, Request
 
+from splatmill.schema import ListOrder
 from splatmill_server.base.paging import MAX_LIMIT
 from splatmill_server.base.problems import ProblemError
 
@@ -26,6 +27,9 @@ TagOf = Annotated[
 Favourite = Annotated[
     bool | None, Query(description="List only records with a star, or, if false, only those without one.")
 ]
+
+
+Sort = Annotated[ListOrder, Query(description="What comes first.")]
 
 
 async def _json_only(request: Request) -> None:  # as a coroutine, it takes no thread of the pool

@@ -8,13 +8,14 @@ from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import JSONResponse, Response
 
-from splatmill.schema import IDEMPOTENCY_HEADER, ChangeLabels, CreateJob, Job, JobPage, JobState
+from splatmill.schema import IDEMPOTENCY_HEADER, ChangeLabels, CreateJob, Job, JobPage, JobState, ListOrder
 from splatmill_server.access.caller import Caller, Who
 from splatmill_server.base.filters import JobFilter
 from splatmill_server.base.paging import DEFAULT_LIMIT
 from splatmill_server.base.problems import ProblemError
+from splatmill_server.jobs.listing import By
 from splatmill_server.requests.ownership import JobId, ListedOwner
-from splatmill_server.requests.parameters import JSON_ONLY, Cursor, Favourite, Limit, NamePart, TagOf
+from splatmill_server.requests.parameters import JSON_ONLY, Cursor, Favourite, Limit, NamePart, Sort, TagOf
 from splatmill_server.routes.job_form import create_from_form
 from splatmill_server.routes.openapi import JOB_REQUESTS, answer, problems
 from splatmill_server.service import Service, Shared
@@ -119,7 +120,7 @@ def _located(error: ValidationError) -> list[Any]:
     return [{**fault, "loc": ("body", *fault["loc"])} for fault in error.errors()]
 
 
-@router.get("", responses=problems("cursor_invalid", "lists_not_ready"))
+@router.get("", responses=problems("cursor_invalid", "lists_not_ready", "list_too_long"))
 def list_jobs(
     service: Shared,
     owner: ListedOwner,
@@ -135,10 +136,15 @@ def list_jobs(
     capture: Annotated[
         str | None, Query(max_length=64, description="List only jobs on the capture with this id.")
     ] = None,
+    sort: Sort = ListOrder.newest,
 ) -> JobPage:
-    """List jobs, newest first. A page of a filtered list may hold fewer than `limit` although it has a `cursor`."""
+    """List jobs. Sorted by size or PSNR, those without a model come last.
+
+    A page of a filtered list may hold fewer than `limit` although it has a `cursor`.
+    """
     states = frozenset(state) if state else None
-    return service.jobs.list(cursor, limit, JobFilter(owner, name, tag, favourite, capture, states))
+    only = JobFilter(owner, name, tag, favourite, capture, states)
+    return service.jobs.list(cursor, limit, only, By(sort, service.models.finished))
 
 
 @router.get("/{job_id}", responses=problems("job_not_found"))

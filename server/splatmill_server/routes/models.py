@@ -2,7 +2,7 @@
 
 from typing import Annotated
 
-from fastapi import APIRouter, Body, Path, Query, Request
+from fastapi import APIRouter, Body, Path, Request
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
@@ -12,10 +12,10 @@ from splatmill.schema import (
     DOWNLOADS,
     POSTER,
     ChangeLabels,
+    ListOrder,
     Model,
     ModelCameras,
     ModelDownloads,
-    ModelOrder,
     ModelPage,
     OrbitRequest,
     RenderRequest,
@@ -26,7 +26,7 @@ from splatmill_server.access.permission import needs
 from splatmill_server.base.filters import Filter
 from splatmill_server.base.paging import DEFAULT_LIMIT
 from splatmill_server.requests.ownership import ListedOwner, ModelId
-from splatmill_server.requests.parameters import JSON_ONLY, Cursor, Favourite, Limit, NamePart, TagOf
+from splatmill_server.requests.parameters import JSON_ONLY, Cursor, Favourite, Limit, NamePart, Sort, TagOf
 from splatmill_server.responses.files import attachment
 from splatmill_server.responses.forward import CLIENT_GONE, forward, while_connected
 from splatmill_server.responses.model_outputs import file_name, model_file, model_in_format, rendered_by_query
@@ -86,7 +86,7 @@ def list_models(
     name: NamePart = None,
     tag: TagOf = None,
     favourite: Favourite = None,
-    sort: Annotated[ModelOrder, Query(description="What comes first.")] = ModelOrder.newest,
+    sort: Sort = ListOrder.newest,
 ) -> ModelPage:
     """List finished models."""
     return service.models.list(cursor, limit, Filter(owner, name, tag, favourite), sort)

@@ -76,6 +76,10 @@ def test_lists_are_narrowed_by_options(at, jobs):
     for command in ("captures", "models"):
         assert invoke(command, "--json", "--owner", "default", *at).stdout
         assert not invoke(command, "--json", "--owner", "nobody", *at).stdout
+    assert listed("--sort", "name") == [jobs[2], jobs[1], jobs[0]]
+    assert listed("--sort", "psnr")[0] == listed("--sort", "size")[0] == jobs[0], "the only one with a model"
+    assert invoke("jobs", "--sort", "colour", *at).exit_code == Exit.usage
+    assert invoke("models", "--sort", "colour", *at).exit_code == Exit.usage
     assert invoke("jobs", "--name", "none such", *at).stdout == "No job matches.\n"
     assert invoke("jobs", "--state", "sleeping", *at).exit_code == Exit.usage
 
@@ -224,6 +228,33 @@ def test_renaming(at, jobs):
     assert invoke("rename", jobs[0], "", *at).stdout == f"The job {jobs[0]} has no name.\n"
     assert invoke("rename", jobs[0], "x" * 201, *at).exit_code != 0
     assert invoke("rename", "0" * 16, "x", *at).exit_code == Exit.not_found
+
+
+def test_tags_and_stars_are_given_and_lists_are_narrowed_by_them(at, jobs):
+    def listed(command: str, *options: str) -> list[str]:
+        printed = invoke(command, "--json", *options, *at).stdout
+        return [json.loads(line)["id"] for line in printed.splitlines()]
+
+    given = invoke("label", jobs[0], "--tags", " Garden , drone,", "--favourite", *at)
+    assert given.stdout == f"The job {jobs[0]} is tagged Garden, drone, with a star.\n"
+    assert invoke("label", jobs[1], "--tags", "drone", *at).stdout == f"The job {jobs[1]} is tagged drone.\n"
+    assert listed("jobs", "--tag", "DRONE") == jobs[1::-1]
+    assert listed("jobs", "--tag", "garden") == listed("jobs", "--favourite") == [jobs[0]]
+    assert listed("jobs", "--no-favourite") == jobs[:0:-1]
+    assert listed("models", "--tag", "drone") == listed("models", "--favourite") == [jobs[0]]
+    for command in ("models", "status"):
+        shown = invoke(command, jobs[0], *at).stdout
+        assert "tags      Garden, drone\n" in shown
+        assert "favourite yes\n" in shown
+    # What is not named stays as it is.
+    assert "tagged Garden, drone." in invoke("label", jobs[0], "--no-favourite", *at).stdout
+    assert invoke("label", jobs[0], "--tags", "", *at).stdout == f"The job {jobs[0]} is without tags.\n"
+    for command in ("models", "jobs"):
+        assert "matches." in invoke(command, "--tag", "garden", *at).stdout
+        assert "matches." in invoke(command, "--favourite", *at).stdout
+    assert invoke("label", jobs[0], *at).exit_code == Exit.usage
+    assert invoke("label", jobs[0], "--tags", "x" * 41, *at).exit_code != 0
+    assert invoke("label", "0" * 16, "--favourite", *at).exit_code == Exit.not_found
 
 
 def test_the_bin(service, at, jobs):

@@ -9,7 +9,7 @@ import pytest
 
 from splatmill.backplane.storage import layout
 from splatmill.schema import JobState, StateEvent
-from splatmill_server import models
+from splatmill_server.jobs import ranking
 from tests.support.served_app import ServedApp, problem, store_model
 
 
@@ -206,18 +206,45 @@ def several(app: ServedApp) -> dict[str, str]:
     return made
 
 
+def names_of(app: ServedApp, noun: str, names: dict[str, str], **query: str | bool) -> list[str]:
+    """The names of the records of a list, read over pages of three."""
+    found: list[str] = []
+    asked: dict[str, str | bool | int] = {**query, "limit": 3}
+    while True:
+        page = app.http.get(f"/v1/{noun}", params=asked).json()
+        found += [names[record["id"]] for record in page[noun]]
+        if page["cursor"] is None:
+            return found
+        asked["cursor"] = page["cursor"]
+
+
+def test_jobs_are_sorted_over_pages_and_those_without_a_model_come_last(
+    app: ServedApp, several: dict[str, str]
+) -> None:
+    names = {job_id: name for name, job_id in several.items()}
+    names |= {app.job(): name for name in ("waits a", "Waits B")}
+    for job_id, name in names.items():
+        app.http.patch(f"/v1/jobs/{job_id}", json={"name": name or None})
+
+    def listed(**query: str | bool) -> list[str]:
+        return names_of(app, "jobs", names, **query)
+
+    assert listed() == listed(sort="newest") == ["Waits B", "waits a", "", "c", "A", "b"]
+    assert listed(sort="name") == ["A", "b", "c", "waits a", "Waits B", ""]
+    assert listed(sort="size") == ["", "b", "A", "c", "Waits B", "waits a"]
+    assert listed(sort="psnr") == ["c", "", "b", "Waits B", "waits a", "A"]
+    assert listed(sort="size", state="queued") == ["Waits B", "waits a"]
+    assert listed(sort="psnr", state="succeeded") == ["c", "", "b", "A"]
+    app.http.patch(f"/v1/jobs/{several['b']}", json={"tags": ["best"], "favourite": True})
+    assert listed(sort="psnr", tag="BEST") == listed(sort="name", favourite=True) == ["b"]
+    assert app.http.get("/v1/jobs", params={"sort": "colour"}).status_code == 422
+
+
 def test_models_are_sorted_over_pages(app: ServedApp, several: dict[str, str]) -> None:
     names = {model_id: name for name, model_id in several.items()}
 
     def listed(**query: str | bool) -> list[str]:
-        found: list[str] = []
-        asked: dict[str, str | bool | int] = {**query, "limit": 3}
-        while True:
-            page = app.http.get("/v1/models", params=asked).json()
-            found += [names[model["id"]] for model in page["models"]]
-            if page["cursor"] is None:
-                return found
-            asked["cursor"] = page["cursor"]
+        return names_of(app, "models", names, **query)
 
     assert listed(sort="newest") == ["", "c", "A", "b"]
     assert listed(sort="name") == ["A", "b", "c", ""]
@@ -247,6 +274,7 @@ def test_the_page_after_a_deleted_model_goes_on(app: ServedApp, several: dict[st
 def test_a_long_list_is_not_sorted(
     app: ServedApp, several: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(models, "SORTED", 3)
-    problem(app.http.get("/v1/models", params={"sort": "size"}), 422, "list_too_long")
-    assert len(app.http.get("/v1/models").json()["models"]) == 4
+    monkeypatch.setattr(ranking, "SORTED", 3)
+    for noun in ("models", "jobs"):
+        problem(app.http.get(f"/v1/{noun}", params={"sort": "size"}), 422, "list_too_long")
+        assert len(app.http.get(f"/v1/{noun}").json()[noun]) == 4

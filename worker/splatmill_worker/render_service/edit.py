@@ -77,6 +77,7 @@ def edit(storage: Storage, model_id: str, request: EditModel, backend: str | Non
     edited = Edited(
         gaussians_before=whole.count,
         gaussians=left.count,
+        crops=request.crops,
         psnr_before=None if before is None else before.psnr,
         psnr=None if after is None else after.psnr,
         views=[EditedView(name=v.name, psnr=v.psnr, ssim=v.ssim) for v in (after.views if after else ())],

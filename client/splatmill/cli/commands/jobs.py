@@ -1,9 +1,10 @@
-"""`splatmill jobs`, `status`, `cancel`, `restart`, `rename` and `options`."""
+"""`splatmill jobs`, `status`, `cancel`, `restart`, `rename`, `label` and `options`."""
 
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from splatmill.cli.commands.records import Favourite, Sort, Tag, label_facts
 from splatmill.cli.display.tables import (
     JsonLines,
     JsonRecord,
@@ -15,7 +16,7 @@ from splatmill.cli.display.tables import (
     printable,
 )
 from splatmill.cli.servers import ServerOption, open_client
-from splatmill.schema import JobState
+from splatmill.schema import JobState, ListOrder
 
 if TYPE_CHECKING:
     from splatmill.schema import Job
@@ -40,6 +41,9 @@ def jobs(
     capture: Annotated[
         str | None, typer.Option("--capture", metavar="ID", help="List only jobs on this capture.")
     ] = None,
+    tag: Tag = None,
+    favourite: Favourite = None,
+    sort: Sort = ListOrder.newest,
     owner: Annotated[
         str | None,
         typer.Option("--owner", help="List only this owner's jobs; it needs a key with the scope admin."),
@@ -48,9 +52,19 @@ def jobs(
     as_json: JsonLines = False,
     server: ServerOption = None,
 ) -> None:
-    """List the jobs, newest first."""
+    """List the jobs, newest first or as --sort says."""
     with open_client(server) as client:
-        listed = list(client.jobs(limit=limit, state=state, name=name, capture=capture, owner=owner))
+        chosen = client.jobs(
+            limit=limit,
+            state=state,
+            name=name,
+            tag=tag,
+            favourite=favourite,
+            capture=capture,
+            sort=sort,
+            owner=owner,
+        )
+        listed = list(chosen)
     if as_json:
         print_lines(listed)
     elif listed:
@@ -59,7 +73,7 @@ def jobs(
             for job in listed
         ]
         print_table(("job", "name", "state", "progress", "created"), rows)
-    elif state or name or capture or owner:
+    elif state or name or tag or favourite is not None or capture or owner:
         typer.echo("No job matches.")
     else:
         typer.echo("There are no jobs yet. Start one with: splatmill train PHOTOS --server URL")
@@ -85,6 +99,7 @@ def status(
     facts = [
         ("job", job.id),
         ("name", job.name or ""),
+        *label_facts(job),
         ("owner", job.owner),
         ("capture", job.capture),
         ("state", job.state.value + (" (cancel requested)" if _cancelling(job) else "")),
@@ -139,6 +154,37 @@ def rename(
     typer.echo(
         f"The job {job.id} is named {printable(job.name)}." if job.name else f"The job {job.id} has no name."
     )
+
+
+def label(
+    job_id: Annotated[
+        str, typer.Argument(metavar="ID", help="Id of the job and of its model.", show_default=False)
+    ],
+    tags: Annotated[
+        str | None,
+        typer.Option(
+            "--tags",
+            metavar="TAGS",
+            help='Its tags, in place of those that it has, as in "garden, drone"; "" takes them away.',
+            show_default=False,
+        ),
+    ] = None,
+    favourite: Annotated[
+        bool | None,
+        typer.Option(
+            "--favourite/--no-favourite", help="Give it a star, or take it away.", show_default=False
+        ),
+    ] = None,
+    server: ServerOption = None,
+) -> None:
+    """Give a job, and its model with it, tags and a star."""
+    if tags is None and favourite is None:
+        raise typer.BadParameter("Say what to change: give --tags, --favourite or --no-favourite.")
+    words = None if tags is None else [tag.strip() for tag in tags.split(",") if tag.strip()]
+    with open_client(server) as client:
+        job = client.job(job_id).label(tags=words, favourite=favourite)
+    said = f"tagged {printable(', '.join(job.tags))}" if job.tags else "without tags"
+    typer.echo(f"The job {job.id} is {said}{', with a star' if job.favourite else ''}.")
 
 
 def options(as_json: JsonLines = False) -> None:

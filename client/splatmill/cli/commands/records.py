@@ -13,14 +13,38 @@ from splatmill.cli.display.tables import (
     print_table,
 )
 from splatmill.cli.servers import ServerOption, open_client
+from splatmill.schema import ListOrder
 
 if TYPE_CHECKING:
-    from splatmill.schema import Capture, Model
+    from splatmill.schema import Capture, Job, Model
 
 Limit = Annotated[int, typer.Option("-n", "--limit", min=1, help="Largest number of records to list.")]
 NamePart = Annotated[
     str | None,
     typer.Option("--name", help="List only records whose name contains this text, in any case of letters."),
+]
+
+Tag = Annotated[
+    str | None,
+    typer.Option(
+        "--tag", help="List only records with this tag, in any case of letters.", show_default=False
+    ),
+]
+Favourite = Annotated[
+    bool | None,
+    typer.Option(
+        "--favourite/--no-favourite",
+        help="List only records with a star, or without one.",
+        show_default=False,
+    ),
+]
+Sort = Annotated[
+    ListOrder,
+    typer.Option(
+        "--sort",
+        metavar="ORDER",
+        help=f"What comes first: {', '.join(ListOrder)}. Size and psnr are those of the model.",
+    ),
 ]
 
 Owner = Annotated[
@@ -59,19 +83,23 @@ def models(
         str | None, typer.Argument(metavar="MODEL", help="Id of a model to show.", show_default=False)
     ] = None,
     name: NamePart = None,
+    tag: Tag = None,
+    favourite: Favourite = None,
+    sort: Sort = ListOrder.newest,
     owner: Owner = None,
     limit: Limit = 20,
     as_json: JsonLines = False,
     server: ServerOption = None,
 ) -> None:
-    """List the finished models, newest first, or show one with its files."""
+    """List the finished models, newest first or as --sort says, or show one with its files."""
     from splatmill.schema import format_bytes
 
     with open_client(server) as client:
         if model_id is not None:
             _show_model(client.model(model_id).model, as_json)
             return
-        listed = list(client.models(name=name, owner=owner, limit=limit))
+        chosen = client.models(name=name, tag=tag, favourite=favourite, sort=sort, owner=owner, limit=limit)
+        listed = list(chosen)
     if as_json:
         print_lines(listed)
     elif listed:
@@ -88,7 +116,8 @@ def models(
         ]
         print_table(("model", "name", "Gaussians", "size", "PSNR", "created"), rows)
     else:
-        typer.echo("No model is finished." if name is owner is None else "No model matches.")
+        narrowed = any(one is not None for one in (name, tag, favourite, owner))
+        typer.echo("No model matches." if narrowed else "No model is finished.")
 
 
 def _show_capture(capture: "Capture", as_json: bool) -> None:
@@ -120,6 +149,7 @@ def _show_model(model: "Model", as_json: bool) -> None:
     facts = [
         ("model", model.id),
         ("name", model.name or ""),
+        *label_facts(model),
         ("owner", model.owner),
         ("created", local_time(model.created_at)),
         ("Gaussians", f"{model.gaussians:,}, spherical harmonics of degree {model.sh_degree}"),
@@ -129,6 +159,11 @@ def _show_model(model: "Model", as_json: bool) -> None:
     if model.files:
         typer.echo()
         print_table(("size", "file"), [(format_bytes(file.size), file.name) for file in model.files])
+
+
+def label_facts(record: "Model | Job") -> list[tuple[str, str]]:
+    """Return the tags and the star of a record, each with its name."""
+    return [("tags", ", ".join(record.tags)), ("favourite", "yes" if record.favourite else "")]
 
 
 def _quality(model: "Model") -> str:

@@ -43,7 +43,10 @@ def edit(
     server: ServerOption = None,
     as_json: JsonRecord = False,
 ) -> None:
-    """Make a new model of a part of MODEL, which is kept, and print its error on held-out photos before and after."""
+    """Make a new model of a part of MODEL, which is kept, and print its error on held-out photos before and after.
+
+    Of a crop there is no error: the photos show what is left out.
+    """
     if box is None and min_opacity is None and max_size is None:
         raise typer.BadParameter("Say what to leave out: give --box, --min-opacity or --max-size.")
     corners = {"min": box[:3], "max": box[3:]} if box is not None else None
@@ -65,6 +68,8 @@ def _summary(done: "Edited") -> str:
     left_out = (
         f"{done.gaussians_before - done.gaussians:,} of {done.gaussians_before:,} Gaussians {verb} left out"
     )
+    if done.crops and done.psnr is not None:
+        return f"{left_out}. The photos show what is left out, so they do not measure what is left."
     if done.psnr is None or done.psnr_before is None:
         return f"{left_out}. There are no held-out photos to measure the error on."
     photos = "1 held-out photo" if len(done.views) == 1 else f"{len(done.views)} held-out photos"

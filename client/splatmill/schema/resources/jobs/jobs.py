@@ -96,7 +96,7 @@ class Job(Response):
 
 
 class JobPage(Response):
-    """A page of jobs, newest first."""
+    """A page of jobs."""
 
     jobs: list[Job]
     cursor: str | None = Field(

@@ -1,5 +1,6 @@
-"""Labels by which people find a job and its model again: the name, the tags and the star."""
+"""Labels by which people find a job and its model again: the name, the tags and the star, and orders of lists."""
 
+from enum import StrEnum
 from typing import Annotated, Self
 
 from pydantic import AfterValidator, Field, StringConstraints, model_validator
@@ -7,6 +8,15 @@ from pydantic import AfterValidator, Field, StringConstraints, model_validator
 from splatmill.schema.base import Label, Request, without_controls
 
 MOST_TAGS = 12
+
+
+class ListOrder(StrEnum):
+    """The order of a list of jobs or models: the newest, the name, the largest model or the highest PSNR first."""
+
+    newest = "newest"
+    name = "name"
+    size = "size"
+    psnr = "psnr"
 
 
 def _without_commas(tag: str) -> str:

@@ -75,6 +75,11 @@ class Edited(Response):
     model: str | None = Field(default=None, description="Id of the new model; null for a preview.")
     gaussians_before: int = Field(ge=0, description="Number of Gaussians of the model.")
     gaussians: int = Field(ge=0, description="Number of Gaussians that are left.")
+    crops: bool = Field(
+        default=False,
+        description="Whether a part of the scene is left out, which the photos still show: psnr and ssim are then no "
+        "measure of what is left.",
+    )
     psnr_before: Measured = Field(
         default=None, description="PSNR in dB of the model, a mean over held-out photos; null without any."
     )

@@ -1,6 +1,5 @@
 """Finished models, their files and their cameras."""
 
-from enum import StrEnum
 from typing import Any
 
 from pydantic import ConfigDict, Field
@@ -15,15 +14,6 @@ HELD_OUT = "held_out"
 
 TIME_LAPSE = "time_lapse"
 """Folder of a model's snapshots of its training, `000.ply` and so on."""
-
-
-class ModelOrder(StrEnum):
-    """The order of a list of models: the newest, the name, the most Gaussians or the highest PSNR first."""
-
-    newest = "newest"
-    name = "name"
-    size = "size"
-    psnr = "psnr"
 
 
 class ModelFile(Response):

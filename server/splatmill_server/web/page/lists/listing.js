@@ -5,6 +5,9 @@ import { byId, h, toggle } from "../dom.js";
 
 const TYPING_MS = 250; // a pause in typing after which the list is asked for again
 
+/** The orders of a list, by the value of the parameter `sort`. */
+const ORDERS = { "": "Newest first", name: "Name", size: "Largest first", psnr: "Highest dB first" };
+
 /**
  * Show the records of a list in `#list`, filtered by the form `#filters`, with `#more` for the next page.
  * @param {object} list
@@ -33,6 +36,8 @@ export async function listing({ noun, limit, query, entry, empty, deleteAll, del
 
   const filters = () => Object.fromEntries([...new FormData(form)].map(([name, value]) => [name, String(value)]));
 
+  byId("favourite").closest("label")?.before(h("div", { class: "field" }, h("label", { for: "sort" }, "Sort by"),
+    h("select", { id: "sort", name: "sort" }, Object.entries(ORDERS).map(([value, text]) => h("option", { value }, text)))));
   for (const [name, value] of new URLSearchParams(location.search)) {
     const control = form.elements.namedItem(name);
     if (control instanceof HTMLInputElement && control.type === "checkbox") control.checked = control.value === value;

@@ -208,7 +208,7 @@ export class Edit {
     this.state.replaceChildren(h("p", { class: "hint" }, "The server renders the held-out photos before and after."));
     try {
       const done = await send("POST", `${this.stage.shown.address}/edits`, edit);
-      this.state.replaceChildren(h("p", { class: "number" }, said(done, Boolean(edit.box ?? edit.selection))),
+      this.state.replaceChildren(h("p", { class: "number" }, said(done)),
         done.model ? h("p", {}, h("a", { href: `/models/${encodeURIComponent(done.model)}` }, "Open the new model")) : "");
     } catch (error) {
       this.state.replaceChildren(noticeOf(/** @type {Error} */ (error)));
@@ -218,11 +218,11 @@ export class Edit {
   }
 }
 
-/** @param {any} done the answer of the server @param {boolean} crops whether a part of the scene is left out */
-function said(done, crops) {
+/** @param {any} done the answer of the server */
+function said(done) {
   const gone = done.gaussians_before - done.gaussians;
   const error = done.psnr === null ? "there are no photos to measure it on"
-    : crops ? "the photos show what is left out, so they do not measure what is left"
+    : done.crops ? "the photos show what is left out, so they do not measure what is left"
     : `${done.psnr_before.toFixed(2)} dB before, ${done.psnr.toFixed(2)} dB after`;
   return `${number(gone)} of ${number(done.gaussians_before)} Gaussians ${done.model ? "are left out" : "would be left out"}: ${error}.`;
 }
