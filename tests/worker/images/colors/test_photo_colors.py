@@ -457,7 +457,8 @@ def test_photos_that_come_with_cameras_are_named_too(tmp_path: Path) -> None:
     frames = []
     for number in range(3):
         name = f"images/{number}.jpg"
-        Image.fromarray(stored(TO_P3)).save(tmp_path / name, icc_profile=DISPLAY_P3 if number else None)
+        profile = DISPLAY_P3 if number else None
+        Image.fromarray(stored(TO_P3)).save(tmp_path / name, icc_profile=profile, quality=90 + number)
         matrix = np.eye(4)
         matrix[0, 3] = number
         frames.append({"file_path": name, "transform_matrix": matrix.tolist()})
