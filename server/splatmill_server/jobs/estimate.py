@@ -70,16 +70,19 @@ def check_time(request: EstimateJob, finished: Sequence[Figures], *, recovered: 
     least = None if within is None else least_within(request, finished, recovered=recovered)
     if within is None or least is None or within >= least:
         return
-    fastest = (
-        f"he fastest of the jobs that have finished here and are most alike would take {least:.0f} s for the "
-        f"cameras of {request.photos} photos, one step on each, and the files."
+    why = (
+        f"The fastest of the jobs that have finished here and are most alike would take {least:.0f} s for the cameras "
+        f"of {request.photos} photos, one step on each, and the files."
     )
-    detail = f"within is {within:g} s; t{fastest}"
-    advice = f"Set within to {math.ceil(least)} s or more, or give fewer photos."
-    what = f"T{fastest} Give {math.ceil(least)} s or more, or fewer photos."
-    error = {"where": "options.within", "what": what, "given": f"{within:g}"}
+    what = f"{why} Give {math.ceil(least)} s or more, or fewer photos."
     raise ProblemError(
-        "option_out_of_range", detail, advice=advice, facts={"images": request.photos, "errors": [error]}
+        "option_out_of_range",
+        f"within is {within:g} s, which is too short. {why}",
+        advice=f"Set within to {math.ceil(least)} s or more, or give fewer photos.",
+        facts={
+            "images": request.photos,
+            "errors": [{"where": "options.within", "what": what, "given": f"{within:g}"}],
+        },
     )
 
 
