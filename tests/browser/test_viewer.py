@@ -23,6 +23,8 @@ from PIL import Image
 from playwright.sync_api import Page, Route, expect
 
 from tests.browser.conftest import Open, SmallModel, Visit
+from tests.browser.test_edit import picture
+from tests.browser.test_model_page import show
 from tests.support import splat_transform
 from tests.support.up import Up
 
@@ -267,6 +269,34 @@ def test_what_lies_beyond_a_radius_is_not_drawn(service: Up, model: SmallModel, 
     assert replaced(shown, head + b"end_header\n" + inside.tobytes()) is None
     rest(shown)
     assert psnr(pixels(shown), hidden) > 45, "it is the model without what lies outside"
+
+
+def test_the_far_background_is_hidden_and_shown_by_the_control_of_the_page(
+    service: Up, model: SmallModel, page: Page
+) -> None:
+    """The page is answered a report of a far shell, which so small a model is trained without."""
+    cameras = service.http.get(f"/v1/models/{model.id}/cameras").json()["cameras"]
+    places = np.array([each["camera"]["camera_to_world"] for each in cameras])[:, :3, 3]
+    file = f"/v1/models/{model.id}/files/model.ply"
+    head, _, rows = service.http.get(file).content.partition(b"end_header\n")
+    means = np.frombuffer(rows, np.float32).reshape(-1, head.count(b"property float"))[:, :3]
+    middle = places.mean(axis=0)
+    spread = np.linalg.norm(places - middle, axis=1).max()
+    report = service.http.get(f"/v1/models/{model.id}/files/report.json").json()
+    report["plan"]["far_shell"] = True
+    # The control leaves what lies within 0.4 of this distance: about half of the Gaussians.
+    report["facts"]["shell_distance"] = float(
+        np.median(np.linalg.norm(means - middle, axis=1)) / spread / 0.4
+    )
+    page.route("**/files/report.json", lambda route: route.fulfill(json=report))
+    show(page, model)
+    whole = picture(page)
+    control = page.get_by_role("button", name="Hide far background")
+    control.click()
+    expect(control).to_have_attribute("aria-pressed", "true")
+    assert psnr(picture(page), whole) < 25
+    control.click()
+    assert psnr(picture(page), whole) > 45
 
 
 def test_nothing_is_drawn_while_nothing_moves(shown: Page) -> None:
