@@ -158,6 +158,17 @@ def test_the_scene_is_watched_while_it_trains(service: Up, capture: str, open_wi
     snapshots(page, shown + 1)
     assert box.get_attribute("data-pose") == turned
     assert seen(page).std() > 0.05
+    # Loaded anew, the page shows the scene from where it began, and leads back there by a button and by a key.
+    page.reload()
+    snapshots(page, 1)
+    expect(box).to_have_attribute("data-pose", before or "")
+    assert seen(page).std() > 0.05
+    view = page.locator("#live .view").first
+    for back in (page.get_by_role("button", name="Start view").click, lambda: view.press("Home")):
+        view.press("ArrowLeft", delay=200)
+        expect(box).not_to_have_attribute("data-pose", before or "")
+        back()
+        expect(box).to_have_attribute("data-pose", before or "")
     page.get_by_role("button", name="Cancel").click()
     page.get_by_role("button", name="Cancel the job").click()
     expect(page.locator("#state")).to_have_text("Cancelled")

@@ -144,6 +144,11 @@ def test_the_view_is_changed_by_its_tools(shown: Page) -> None:
     with shown.expect_response(re.compile("/files/time_lapse/")):
         shown.get_by_label("Time-lapse").fill("0")
     expect(shown.locator(".view .said")).to_be_empty()  # no words about loading stay
+    scrubber = shown.locator(".scrubber")
+    scrubber.get_by_role("button", name="Play").click()
+    expect(scrubber.locator("output")).to_contain_text("the finished model")
+    expect(scrubber.get_by_role("button", name="Play")).to_be_visible()  # it has come to the end
+    expect(shown.locator(".view .said")).to_be_empty()
     # The ring of the focus is seen at the edge of the canvas.
     shown.keyboard.press("Shift")
     shown.locator(".view").focus()
@@ -256,10 +261,6 @@ def test_a_model_that_is_not_there_is_said(visit: Visit) -> None:
     expect(alert).to_contain_text("There is no model '0123456789abcdef'.")
     expect(alert).to_contain_text("The list of models shows those that are there.")
     assert "/v1/" not in visit.page.inner_text("main")
-    visit.page.goto("/nothing/here")
-    expect(visit.page.get_by_role("heading", level=1)).to_have_text("There is no page at this address")
-    visit.page.get_by_role("link", name="Models").click()
-    expect(visit.page.get_by_role("heading", level=1)).to_have_text("Models")
 
 
 def test_deleting_asks_first(model: SmallModel, shown: Page) -> None:

@@ -25,6 +25,25 @@ def test_pages_fit_a_phone_and_have_one_heading(service: Up, open_window: Open, 
     assert page.evaluate("document.documentElement.scrollWidth") <= 360
 
 
+def test_an_unknown_address_has_a_page_for_people_and_a_problem_for_programs(visit: Visit) -> None:
+    visit.watched.allow("status of 404")
+    page = visit.page
+    answer = page.goto("/nothing/here")
+    assert answer is not None
+    assert answer.status == 404
+    expect(page.get_by_role("heading", level=1)).to_have_text("There is no page at this address")
+    expect(page.locator("main")).to_contain_text("mistyped")
+    # Scripts ask for anything, and not for HTML.
+    problem = """fetch("/nothing/here").then(async (answer) => {
+      const { status, code } = await answer.json();
+      return [answer.status, answer.headers.get("Content-Type"), status, code];
+    })"""
+    assert page.evaluate(problem) == [404, "application/problem+json", 404, "not_found"]
+    page.get_by_role("link", name="New scene").click()
+    page.locator("html[data-ready]").wait_for()
+    expect(page.get_by_role("link", name="New", exact=True)).to_have_attribute("aria-current", "page")
+
+
 @pytest.mark.parametrize("width", [360, 1024])
 @pytest.mark.parametrize("noun", ["jobs", "models"])
 def test_the_pages_of_a_record_fit(
