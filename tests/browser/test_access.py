@@ -25,8 +25,8 @@ def test_axe_finds_nothing_serious(service: Up, model: SmallModel, open_window: 
         ("/jobs", "#list li"),
         ("/models", "#storage table"),
         ("/sign-in", "#already"),
-        (link, "#view .view"),
-        (f"{link}/embed", "#view .view"),
+        (link, ".view-bar button"),
+        (f"{link}/embed", ".view-bar button"),
     ):
         page.goto(path)
         expect(page.locator(ready).first).to_be_visible()
