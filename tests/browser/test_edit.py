@@ -16,7 +16,7 @@ import pytest
 from PIL import Image
 from playwright.sync_api import Locator, Page, expect
 
-from tests.browser.conftest import SmallModel
+from tests.browser.conftest import SmallModel, Visit
 from tests.browser.test_model_page import WAIT, show
 from tests.support.up import Up
 
@@ -110,6 +110,26 @@ def test_the_box_is_moved_by_its_handles_and_back(panel: Locator, page: Page) ->
     ends["from"].fill(str(first["to"] + 1))
     ends["from"].press("Tab")
     assert float(ends["from"].input_value()) == first["to"], "a box has no side of less than nothing"
+
+
+def test_a_box_that_holds_nothing_is_refused_beside_its_button(
+    service: Up, panel: Locator, page: Page, visit: Visit
+) -> None:
+    visit.watched.allow("status of 422")
+    models = service.http.get("/v1/models").json()["models"]
+    ends = [panel.get_by_label(f"The box along x, {end}") for end in ("from", "to")]
+    ends[0].fill(ends[1].input_value())
+    ends[0].press("Tab")
+    expect(panel.get_by_role("status")).to_have_text("Give the box along x as two different numbers.")
+    for end, far in zip(reversed(ends), ("100002", "100001"), strict=True):
+        end.fill(far)
+        end.press("Tab")
+    panel.get_by_role("button", name="Make a new model").click()
+    said = panel.get_by_role("status")
+    expect(said).to_contain_text("The edit leaves no Gaussian of the model.", timeout=WAIT)
+    expect(said).to_contain_text("Choose a larger box, a lower opacity or a larger size.")
+    expect(panel.get_by_role("button", name="Make a new model")).to_be_enabled()
+    assert service.http.get("/v1/models").json()["models"] == models
 
 
 def test_lengths_are_in_the_unit_of_the_model(service: Up, page: Page, model: SmallModel) -> None:

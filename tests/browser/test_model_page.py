@@ -171,7 +171,15 @@ def test_files_and_the_orbit_video_are_there(
     size = service.http.get(f"/v1/models/{model.id}").json()["bytes"]
     downloading.value.save_as(tmp_path / "model.ply")
     assert (tmp_path / "model.ply").stat().st_size == size
-    shown.get_by_label("Length, in seconds").fill("4")
+    length, said = shown.get_by_label("Length, in seconds"), shown.locator("#orbit .hint")
+    for impossible in ("", "0.1", "61"):
+        length.fill(impossible)
+        shown.get_by_role("button", name="Make the video").click()
+        expect(said).to_have_text("A video has 0.5 to 60 seconds.")
+        expect(length).to_be_focused()
+        expect(length).to_have_attribute("aria-invalid", "true")
+        shown.get_by_label("The camera").focus()
+    length.fill("4")
     shown.get_by_role("button", name="Make the video").click()
     shown.get_by_role("button", name="Stop").click()
     expect(shown.locator("#orbit .hint")).to_have_text("Stopped.")

@@ -197,6 +197,26 @@ def test_the_keyboard_selects_too(panel: Locator, page: Page) -> None:
     assert not violations(page)
 
 
+def test_a_distance_that_is_none_selects_nothing_and_is_said(panel: Locator, page: Page) -> None:
+    box, far = (
+        panel.get_by_label("Keep only what lies in the box"),
+        panel.get_by_label("Only up to a distance"),
+    )
+    far.fill("-3")
+    panel.get_by_role("button", name="Select in the middle").click()
+    expect(panel.locator("[aria-live]")).to_have_text("The distance is a number over 0, or left empty.")
+    expect(far).to_be_focused()
+    expect(far).to_have_attribute("aria-invalid", "true")
+    expect(box).to_be_checked()
+    panel.get_by_role("button", name="Brush").click()
+    draw(page, (0.4, 0.5), (0.6, 0.5))
+    expect(panel.locator("[aria-live]")).to_have_text("The distance is a number over 0, or left empty.")
+    far.fill("")
+    panel.get_by_role("button", name="Select in the middle").click()
+    assert count(panel) > 0
+    expect(far).to_have_attribute("aria-invalid", "false")
+
+
 def test_a_finger_paints_and_two_move_the_scene(service: Up, model: SmallModel, open_window: Open) -> None:
     visit = open_window(service, **PHONE)
     page = visit.page

@@ -144,10 +144,11 @@ export class Edit {
 
   /** Take over an end of the box as it was typed. @param {number} axis @param {string} end "from" or "to" */
   typed(axis, end) {
-    const field = this.ends[axis][end === "from" ? 0 : 1];
+    const [field, other] = end === "from" ? this.ends[axis] : [...this.ends[axis]].reverse();
     const value = field.value === "" ? NaN : Number(field.value) / this.factor;
     const [from, to] = end === "from" ? [value, this.box.max[axis]] : [this.box.min[axis], value];
-    const valid = Number.isFinite(value) && from !== to;
+    // As people read them: the other end is shown rounded.
+    const valid = Number.isFinite(value) && Number(field.value) !== Number(other.value);
     this.state.replaceChildren(valid ? "" : h("p", { class: "error" }, `Give the box along ${AXES[axis]} as two different numbers.`));
     if (valid) {
       const [min, max] = [/** @type {Vec} */ ([...this.box.min]), /** @type {Vec} */ ([...this.box.max])];

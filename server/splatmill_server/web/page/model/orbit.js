@@ -40,8 +40,9 @@ export async function showOrbit(section, { model, address, background }, stage) 
       stage.path.button.focus();
       return;
     }
-    length.setAttribute("aria-invalid", String(!length.checkValidity()));
-    if (!length.checkValidity() || !length.value) {
+    const possible = length.checkValidity() && length.value !== "";
+    length.setAttribute("aria-invalid", String(!possible));
+    if (!possible) {
       state.textContent = "A video has 0.5 to 60 seconds.";
       length.focus();
       return;

@@ -84,7 +84,7 @@ export class Selecting {
   /** Stamp the brush onto the middle of the view, as the keyboard does. */
   atTheMiddle() {
     const { view } = this;
-    if (!view) return;
+    if (!view || this.refuses()) return;
     if (!this.drawn.length) this.on.began();
     const { width, height } = view.getCamera();
     this.add([[width / 2, height / 2]], false, Number(this.width.value) / 2);
@@ -98,7 +98,7 @@ export class Selecting {
    */
   add(line, other, radius = this.tool === "brush" ? Number(this.width.value) / 2 : null) {
     const { view, chosen } = this;
-    if (!view) return;
+    if (!view || this.refuses()) return;
     if (chosen.strokes.length === MOST_STROKES) {
       this.say(`A selection has at most ${MOST_STROKES} strokes. Make the new model, and go on with that.`);
       return;
@@ -120,6 +120,18 @@ export class Selecting {
       subtract: subtract !== chosen.inverted,
     });
     this.choose({ ...chosen, strokes: [...chosen.strokes, this.drawn.length - 1] });
+  }
+
+  /** Whether the largest distance is no number over 0; names what it has to be, and leads there. */
+  refuses() {
+    const { badInput } = this.far.validity;
+    const wrong = badInput || (this.far.value !== "" && !(Number(this.far.value) > 0));
+    this.far.setAttribute("aria-invalid", String(wrong));
+    if (wrong) {
+      this.say("The distance is a number over 0, or left empty.");
+      this.far.focus();
+    }
+    return wrong;
   }
 
   /** Largest distance that counts: what was typed, and not beyond a far background that is hidden. @param {View} view */
