@@ -10,14 +10,14 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import UTC, datetime
 from queue import Empty, SimpleQueue
 from types import FrameType
 from typing import TYPE_CHECKING
 
 from splatmill.cli.display.progress import Display, make_display, show
 from splatmill.errors import Conflict
-from splatmill.schema import EventRecord
+from splatmill.schema import EventRecord, ProgressEvent, StateEvent
 
 if TYPE_CHECKING:
     from splatmill.sdk.client import JobHandle, ModelHandle
@@ -80,10 +80,15 @@ def _until_ended(
     since: datetime | None,
 ) -> None:
     cancelling: Interruption | None = None
+    changed = datetime.min.replace(tzinfo=UTC)  # when the last state began
     while True:
         item = _next(inbox)
         if isinstance(item, EventRecord):
-            if since is None or item.at >= since:
+            if isinstance(item.event, StateEvent):
+                changed = item.at
+            # States and progress are two streams: the last progress of a state may be read after the next state.
+            late = isinstance(item.event, ProgressEvent) and item.at < changed
+            if not late and (since is None or item.at >= since):
                 show(item, display, verbose=verbose)
         elif isinstance(item, EventsEnded):
             return

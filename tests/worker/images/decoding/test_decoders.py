@@ -100,10 +100,11 @@ def test_photos_that_have_been_read_take_no_memory(photos: Path, confinement: De
     gc.collect()
     gc.disable()
     try:
+        # Three pictures of 100 MB: less than one of them may stay, as pieces of the heap of a process with many tests.
         before = [process.memory_info().rss for process in (psutil.Process(), child)]
         for _ in range(3):
             assert decoders.decode(photos / "big.png").size == (10_000, 10_000)
-        assert psutil.Process().memory_info().rss < before[0] + 50_000_000
+        assert psutil.Process().memory_info().rss < before[0] + 90_000_000
         # It writes an answer shortly before its memory is free.
         wait_for(lambda: child.memory_info().rss < before[1] + 50_000_000)
     finally:
