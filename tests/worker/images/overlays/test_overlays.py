@@ -16,6 +16,7 @@ import pytest
 from PIL import Image, ImageDraw
 
 from splatmill_worker.images.overlays.overlay import MIN_PHOTOS
+from splatmill_worker.images.overlays.overlays import Candidate, hidden_in
 from splatmill_worker.images.prepare import Prepared, prepare
 from splatmill_worker.synthetic import look_at, orbit, photograph, still_life
 
@@ -160,6 +161,25 @@ def test_a_rim_and_a_horizon_that_stay_on_a_level_circle_are_not_masked(tmp_path
     result = prepare(folder, None, tmp_path / "work")
     assert result.overlays == ()
     assert [photo.mask for photo in result.photos] == [None] * 24
+
+
+def test_a_part_that_is_transparent_in_all_photos_is_no_overlay() -> None:
+    """As the sky of renderings, whose cameras are known. A logo in the opaque part is found all the same."""
+    alpha = Image.new("L", (WIDTH, HEIGHT), 255)
+    alpha.paste(0, (0, 0, WIDTH, HEIGHT // 4))
+    given = [Candidate(f"{k:02d}.png", WIDTH, HEIGHT, "") for k in range(16)]
+
+    def hidden(change: Draw) -> list[np.ndarray | None]:
+        cut = [change(photo, k) for k, photo in enumerate(photos()[:16])]
+        for photo in cut:
+            photo.putalpha(alpha)
+        return list(hidden_in(given, lambda index, size: cut[index]).regions)
+
+    assert hidden(lambda photo, k: photo.copy()) == [None] * 16
+    (region, *_) = hidden(drawn(lambda pen, k: letters(pen, 10, 215)))
+    assert region is not None
+    assert region[-9, 30]  # at 160 x 120
+    assert not region[:30].any()
 
 
 def test_few_photos_have_nothing_masked(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ watermarks", CVPR 2017, find watermarks by such a mean of gradients.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -108,6 +108,11 @@ class Still:
             elif low > 0.5 * size:
                 names.append(last)
         return f"at the {' '.join(names)}" if names else "in several places"
+
+    def without(self, part: Region) -> Still | None:
+        """The same without a part of the picture and MARGIN around it; None where nothing is left."""
+        region = self.region & ~_grown(part, MARGIN)
+        return replace(self, region=region, share=float(region.mean())) if region.any() else None
 
 
 def still(count: int, picture: Callable[[int, int], Grey]) -> Still | None:

@@ -99,7 +99,10 @@ def hidden_in(photos: Sequence[Candidate], decode: Callable[[int, tuple[int, int
     shown, warnings = [], []
     for members in groups.values():
         first = photos[members[0]]
-        found = still(len(members), _pictures(first, members, decode))
+        clear: list[Region] = []
+        found = still(len(members), _pictures(first, members, decode, clear))
+        if found is not None:  # what is transparent in all of them is known to be empty
+            found = found.without(np.logical_and.reduce(clear))
         if found is None:
             continue
         names = tuple(photos[index].name for index in members)
@@ -122,14 +125,24 @@ def hidden_in(photos: Sequence[Candidate], decode: Callable[[int, tuple[int, int
 
 
 def _pictures(
-    first: Candidate, members: Sequence[int], decode: Callable[[int, tuple[int, int]], Image.Image]
+    first: Candidate,
+    members: Sequence[int],
+    decode: Callable[[int, tuple[int, int]], Image.Image],
+    clear: list[Region],
 ) -> Callable[[int, int], npt.NDArray[np.float32]]:
-    """The grey pictures of the photos `members`, as `still` asks for them; `first` is one of them."""
+    """The grey pictures of the photos `members`, as `still` asks for them; `first` is one of them.
+
+    clear: gets the transparent part [h,w] of each small one.
+    """
 
     def picture(index: int, factor: int) -> npt.NDArray[np.float32]:
         width, height = training_size(first.width, first.height, SMALL_SIDE)
         size = width * factor, height * factor
-        grey = Image.fromarray(small_grey(decode(members[index], size), SMALL_SIDE * factor))
+        photo = decode(members[index], size)
+        if factor == 1:
+            alpha = photo.getchannel("A") if photo.mode == "RGBA" else Image.new("L", size, 255)
+            clear.append(np.asarray(alpha.resize(size, Image.Resampling.HAMMING)) < 128)
+        grey = Image.fromarray(small_grey(photo, SMALL_SIDE * factor))
         return np.asarray(grey.resize(size, Image.Resampling.HAMMING), np.float32)
 
     return picture
