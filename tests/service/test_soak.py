@@ -25,4 +25,5 @@ def test_a_fault_of_each_kind_loses_nothing() -> None:
     *faults, end = soak.soak(s3=False, count=0, seed=1, only=KINDS, patience=3.0)
     assert {row["fault"] for row in faults} | end["left_out"].keys() >= set(KINDS)
     assert end["complaints"] == []
-    assert end["succeeded"] >= 1  # how many the machine has time for is not proven
+    assert end["succeeded"] + end["cancelled"] == end["jobs"]
+    assert end["succeeded"] >= 1  # the number of jobs depends on the speed of the machine
