@@ -369,7 +369,11 @@ def test_one_job_is_made_of_two_clicks_and_of_a_lost_answer(
             route.continue_()
 
     page.route("**/v1/jobs", lose_first)
+    expect(page.locator("#estimate p")).not_to_have_count(0, timeout=CHECKED)
+    page.evaluate("document.getElementById('estimate').replaceChildren()")
     page.get_by_role("button", name="Upload and train").dblclick()
+    # The next estimate, which is asked for as soon as the button has failed, leaves the reason where it is.
+    expect(page.locator("#estimate p")).not_to_have_count(0, timeout=CHECKED)
     expect(page.get_by_text("The server did not answer.")).to_be_visible(timeout=CHECKED)
     page.get_by_role("button", name="Train", exact=True).click()
     job = started(page, service)

@@ -73,13 +73,15 @@ export async function showDownloads(section, { model, address }) {
   const made = async (row) => {
     if (!row.madeAt || making.has(row.madeAt)) return;
     making.add(row.madeAt);
-    state.replaceChildren(h("p", { class: "hint" }, `The server makes ${row.name}. The download begins when it is there.`));
+    const said = h("div", { "data-of": row.name }, h("p", { class: "hint" }, `The server makes ${row.name}. The download begins when it is there.`));
+    state.querySelector(`[data-of="${row.name}"]`)?.remove();
+    state.append(said);
     try {
       await tell();
       await request("GET", row.madeAt, { headers: { Range: "bytes=0-0" } });
-      state.replaceChildren();
+      said.remove();
     } catch (error) {
-      state.replaceChildren(noticeOf(/** @type {Error} */ (error)));
+      said.replaceChildren(noticeOf(/** @type {Error} */ (error)));
     } finally {
       making.delete(row.madeAt);
       await tell().catch(() => {}); // the rows as they were stand
@@ -87,7 +89,7 @@ export async function showDownloads(section, { model, address }) {
   };
 
   show(files);
-  await tell().catch((error) => state.replaceChildren(noticeOf(error, "warning")));
+  await tell().catch((error) => state.append(noticeOf(error, "warning")));
 }
 
 /**

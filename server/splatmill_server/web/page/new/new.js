@@ -36,6 +36,9 @@ let estimating;
 /** What the last estimate was asked for. */
 let asked = "";
 
+/** The settings and files that the button was refused with: why it was stays shown until they are changed. */
+let refusedWith = "";
+
 const caller = await startShell();
 const [info, { options }] = await Promise.all([get("/v1/info"), get("/v1/options")]);
 const items = new Items(info.accepted, info.limits.max_image_pixels);
@@ -219,6 +222,12 @@ function job() {
   return { photos, body: { photos: Math.max(1, photos ?? 1), exact, posed, capture: start.capture, options: values } };
 }
 
+/** What the job would be made of, as text to compare. */
+function contents() {
+  const { body, photos } = job();
+  return JSON.stringify([body.options, photos, items.used.map(({ name, file }) => [name, file.size]), items.lacking]);
+}
+
 async function estimate() {
   if (byId("go").hidden || start.busy) return;
   const { body, photos } = job();
@@ -228,8 +237,7 @@ async function estimate() {
   try {
     const estimate = await send("POST", "/v1/estimate", body);
     if (asked !== question) return;
-    form.show(null);
-    showProblem(null);
+    if (refusedWith !== contents()) showProblem(null);
     byId("estimate").replaceChildren(items.lacking ? h("p", { class: "error" }, items.lacking) : photos === null
       ? h("p", {}, "How long it will take is not known: the server has yet to count the photos in the archive.")
       : estimateOf(estimate, photos, info.queued, body.options));
@@ -249,6 +257,7 @@ function showProblem(problem) {
 
 /** Show why the button did nothing, and lead to the field that is to be changed. @param {Error | null} problem */
 function refused(problem) {
+  refusedWith = problem ? contents() : "";
   showProblem(problem);
   form.lead();
 }
