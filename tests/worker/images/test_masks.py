@@ -4,6 +4,7 @@ Does not prove that hidden pixels stay out of the training; the tests of loading
 """
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -57,6 +58,20 @@ def test_masks_among_the_photos_are_used_and_counted(tmp_path: Path, form: str) 
     assert found.skipped == ()
     assert found.notes == ("3 of 4 photos have a mask; the masks hide 25% of their pixels.",)
     assert found.warnings == ()
+
+
+@pytest.mark.parametrize("masked", ["0.png", "0 copy.png"])
+def test_of_two_files_of_one_photo_that_with_the_short_name_is_used_with_the_mask_of_either(
+    tmp_path: Path, masked: str
+) -> None:
+    for number in range(3):
+        photo(tmp_path / f"images/{number}.png", number)
+    shutil.copy(tmp_path / "images/0.png", tmp_path / "images/0 copy.png")
+    mask(tmp_path / "masks" / masked, 0.25)
+    found = prepared(tmp_path, "masks")
+    assert [one.name for one in found.photos] == ["0.png", "1.png", "2.png"]
+    assert [one.mask for one in found.photos] == [tmp_path / "masks" / masked, None, None]
+    assert found.skipped == (("0 copy.png", "its content is the same as that of 0.png"),)
 
 
 def test_masks_with_other_suffixes_in_their_folder(tmp_path: Path) -> None:

@@ -181,19 +181,24 @@ def prepare(
                 found.skipped.append((name, inspection))
                 continue
             result, small[name] = inspection
-            same = photos.get(result.sha256)
-            if same is not None:
-                found.skipped.append((name, f"its content is the same as that of {same.name}"))
-                continue
             try:
-                photos[result.sha256] = _with_mask(result, mask_files.get(pairs.get(name, "")), found)
+                result = _with_mask(result, mask_files.get(pairs.get(name, "")), found)
             except UnusablePicture as error:
                 if error.code != "decoder_ended":
                     raise
                 found.skipped.append((name, f"of its mask: {error.reason}"))
                 continue
-            if result.several:
-                found.notes.append(f"{name} holds several pictures; the first one is used.")
+            if (same := photos.get(result.sha256)) is not None:
+                # Programs call a copy "a (1).jpg" or "a copy.jpg".
+                result, copy = sorted((same, result), key=lambda photo: (len(photo.name), photo.name))
+                result = replace(result, mask=result.mask or copy.mask)
+                found.skipped.append((copy.name, f"its content is the same as that of {result.name}"))
+            photos[result.sha256] = result
+    found.notes += [
+        f"{photo.name} holds several pictures; the first one is used."
+        for photo in photos.values()
+        if photo.several
+    ]
     if not photos and found.skipped and decoders.forget_ended():
         # The cause may lie outside of the photos, such as a lack of memory, which ends processes for any photo.
         name, reason = found.skipped[0]
@@ -304,8 +309,8 @@ def _without_depth(photos: list[UsablePhoto], found: _Found) -> list[UsablePhoto
 
 
 def _picture(photo: UsablePhoto, small: dict[str, SmallPicture], at_least: tuple[int, int]) -> Image.Image:
-    """The photo at least so large; the small picture where that suffices."""
-    if max(at_least) <= copies.SMALL_SIDE:
+    """The photo at least so large; the small picture, which has no transparency, where that suffices."""
+    if max(at_least) <= copies.SMALL_SIDE and photo.alpha[0] >= transparency.SOLID:
         return Image.fromarray(small[photo.name].grey)
     return decoders.decode(photo.path, at_least=at_least)
 

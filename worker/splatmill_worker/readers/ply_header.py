@@ -114,8 +114,10 @@ def _check(header: Header, elements: tuple[Element, ...], left: int) -> None:
         count = element.count
         needed = count * row - (1 if text and count else 0)  # the last line may lack its end
         if count < 0 or (count > 0 and row == 0) or needed > left:
+            cut = ": it is cut off" if count > 0 and row > 0 else ""
             raise ValueError(
-                f"its header announces {count} {element.name} rows of {row} bytes or more, and {left} bytes follow"
+                f"its header announces {count} {element.name} rows of {row} bytes or more, and {left} bytes "
+                f"follow{cut}"
             )
         left -= needed
 

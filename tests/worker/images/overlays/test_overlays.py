@@ -182,6 +182,21 @@ def test_a_part_that_is_transparent_in_all_photos_is_no_overlay() -> None:
     assert not region[:30].any()
 
 
+def test_the_same_is_so_where_cameras_are_recovered(tmp_path: Path) -> None:
+    """The small pictures by which photos are compared have grey in place of what is transparent."""
+    alpha = Image.new("L", (WIDTH, HEIGHT), 255)
+    alpha.paste(0, (0, 0, WIDTH, HEIGHT // 4))
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for k, photo in enumerate(photos()[:16]):
+        cut = photo.copy()
+        cut.putalpha(alpha)
+        cut.save(folder / f"{k:02d}.png")
+    result = prepare(folder, None, tmp_path / "work")
+    assert result.overlays == ()
+    assert [photo.mask for photo in result.photos] == [None] * 16
+
+
 def test_few_photos_have_nothing_masked(tmp_path: Path) -> None:
     assert prepared(tmp_path, FOUND["a logo"][0], MIN_PHOTOS - 1).overlays == ()
 

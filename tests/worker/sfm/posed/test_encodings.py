@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from splatmill.schema.files.names import storable_name
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.readers import colmap_files
 from splatmill_worker.sfm.posed.encodings import NamesUnclear
@@ -30,6 +31,10 @@ SYSTEMS = {
 
 def in_bytes(encoding: str):
     return lambda text: text.encode(encoding)
+
+
+def in_bytes_of_the_system(text: str) -> bytes:
+    return text.encode("utf-8", "surrogateescape")
 
 
 @pytest.mark.parametrize(("encoding", "word"), SYSTEMS.items(), ids=SYSTEMS.keys())
@@ -101,6 +106,25 @@ def test_a_remark_in_another_encoding_leaves_names_in_ascii_as_they_are(tmp_path
     scene = loaded(tmp_path)
     check(scene, {name: k for k, name in enumerate(names)})
     assert scene.warnings == ()
+
+
+@pytest.mark.parametrize("kind", ["COLMAP", "transforms"])
+def test_names_of_the_same_bytes_as_those_of_the_photos_are_theirs(tmp_path: Path, kind: str) -> None:
+    """As copied from a system with another encoding: no photo can be stored under such a name."""
+    there = [f"Geb\udce4ude {k}.jpg" for k in range(3)]
+    stored = [storable_name(name) for name in there]
+    photos(tmp_path / "images", stored)
+    if kind == "COLMAP":
+        model(tmp_path / "sparse/0", dict(enumerate([*there, "J\udcfcrgen.jpg"])), in_bytes_of_the_system)
+    else:
+        text = json.dumps(
+            {"w": 64, "h": 48, "fl_x": 60, "frames": frames([*there, "J\udcfcrgen.jpg"])}, ensure_ascii=False
+        )
+        (tmp_path / "transforms.json").write_bytes(in_bytes_of_the_system(text))
+    scene = loaded(tmp_path)
+    check(scene, {name: k for k, name in enumerate(stored)})
+    ((name, _),) = scene.left_out
+    assert name.rpartition("/")[2] == "J\ufffdrgen.jpg"
 
 
 def test_photos_in_folders_and_other_cases_are_found(tmp_path: Path) -> None:

@@ -105,10 +105,15 @@ def test_any_order_of_properties_and_extra_ones_are_read(tmp_path: Path) -> None
             b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n",
             "rot_3 are missing",
         ),
+        (
+            b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
+            b"end_header\n0 0 0\n",
+            "it holds points alone, a cloud or a mesh",
+        ),
         (b"ply\nformat ascii 1.0\nelement face 0\nproperty float x\nend_header\n", "no vertex element"),
         (
             b"ply\nformat binary_little_endian 1.0\nelement vertex 9\nproperty float x\nend_header\n\0\0",
-            "could not be read",
+            "announces 9 vertex rows of 4 bytes or more, and 2 bytes follow: it is cut off",
         ),
     ],
 )

@@ -21,7 +21,9 @@ def decoded(model: GivenModel, files: ImageFiles) -> tuple[GivenModel, tuple[str
     Raises NamesUnclear.
     """
     names = {image.name for image in model.images.values()} | {name for name, _ in model.faulty}
-    unclear = {name: raw for name in sorted(names) if (raw := _bytes(name)) is not None}
+    stored = {name: found[0] for name in names if not_utf8(name) and (found := files.photo(name)) is not None}
+    model = _named(model, stored)
+    unclear = {name: raw for name in sorted(names - stored.keys()) if (raw := not_utf8(name)) is not None}
     if not unclear:
         return model, ()
     readings: dict[str, dict[str, str]] = {}
@@ -74,8 +76,11 @@ def chosen(
     )
 
 
-def _bytes(name: str) -> bytes | None:
-    """The bytes of a name that is not UTF-8; None for others."""
+def not_utf8(name: str) -> bytes | None:
+    """The bytes of a name that is not UTF-8, whose other bytes are surrogates; None for other names.
+
+    Photos with names in such bytes are stored under others made of them, which `ImageFiles.photo` finds by them.
+    """
     raw = name.encode("utf-8", "surrogateescape")
     return None if raw.decode("utf-8", "replace") == name else raw
 

@@ -29,7 +29,7 @@ from splatmill_worker.scene import Scene, Source, View, viewmat_of
 from splatmill_worker.sfm.posed import parts, polycam
 from splatmill_worker.sfm.posed.camera_models import UnreadModel, check_pixels, kind_of, panorama, radians
 from splatmill_worker.sfm.posed.colmap_model import camera_and_lens, fit_to_file
-from splatmill_worker.sfm.posed.encodings import NamesUnclear, chosen
+from splatmill_worker.sfm.posed.encodings import NamesUnclear, chosen, not_utf8
 from splatmill_worker.sfm.posed.files import ImageFiles, alternatives, instead, missing, none_usable
 from splatmill_worker.sfm.posed.model_files import MAX_DISTANCE, MAX_PARAMETER, MAX_SIDE, MOST_FAULTY
 from splatmill_worker.sfm.posed.one_camera import one_for_each
@@ -196,6 +196,8 @@ def _parsed(path: Path, files: ImageFiles) -> tuple[Any, tuple[str, ...]]:
         try:
             return json.loads(text), ()
         except UnicodeDecodeError:
+            if (document := _with_stored_names(text, files)) is not None:
+                return document, ()
             names: dict[str, dict[int, str]] = {}
             for encoding in ENCODINGS:
                 # The text is decoded before it is parsed: in some encodings, a letter has the byte of a backslash.
@@ -207,6 +209,23 @@ def _parsed(path: Path, files: ImageFiles) -> tuple[Any, tuple[str, ...]]:
         raise
     except (OSError, ValueError, RecursionError) as error:
         raise ValueError(f"{path.name} is not readable JSON: {plain(error)}.") from error
+
+
+def _with_stored_names(text: bytes, files: ImageFiles) -> Any:
+    """The value in a JSON text whose names have the same bytes as those of the photos; None where none has."""
+    with suppress(ValueError):
+        paths = _file_paths(json.loads(text.decode("utf-8", "surrogateescape")))
+        stored = {
+            index: found[0]
+            for index, path in paths.items()
+            if not_utf8(path) and (found := files.photo(path)) is not None
+        }
+        if stored:
+            document = json.loads(text.decode("utf-8", "replace"))
+            for index, name in stored.items():
+                document["frames"][index]["file_path"] = name
+            return document
+    return None
 
 
 def _file_paths(document: Any) -> dict[int, str]:

@@ -57,7 +57,9 @@ def gaussians_of(vertex: PlyElement) -> tuple[Gaussians, tuple[str, ...]]:
     every = ("x", "y", "z", *colors, *(f"f_rest_{i}" for i in range(rest)), "opacity", *scales, *quats)
     missing = [name for name in every if name not in present]
     if missing:
-        raise ValueError(f"the properties {', '.join(missing)} are missing")
+        no_gaussians = {"x", "y", "z"} <= present and not present & {"opacity", *scales, *quats}
+        what = "; it holds points alone, a cloud or a mesh" if no_gaussians else ""
+        raise ValueError(f"the properties {', '.join(missing)} are missing{what}")
 
     notes = rest_notes(degree_of(rest) or 0)
     if by_channel:
