@@ -7,6 +7,7 @@ Does not prove what the viewer draws: tests/browser/test_viewer.py does.
 from __future__ import annotations
 
 import io
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -235,6 +236,32 @@ def test_a_format_is_made_when_it_is_asked_for_and_its_row_is_told_anew(
         downloading.value.save_as(tmp_path / name)
         assert (tmp_path / name).read_bytes().startswith(start)
     expect(row("SOG, version 2").get_by_role("cell").nth(1)).to_contain_text("kB", timeout=WAIT)
+
+
+def test_why_a_format_is_not_made_stays_while_another_one_is(
+    visit: Visit, shown: Page, model: SmallModel
+) -> None:
+    problem = {
+        "type": "about:blank",
+        "title": "No",
+        "status": 507,
+        "detail": "The disk is full.",
+        "code": "storage_full",
+    }
+    visit.watched.allow("507")
+    shown.route(
+        f"**/v1/models/{model.id}/**spz*",
+        lambda route: route.fulfill(
+            status=507, content_type="application/problem+json", body=json.dumps(problem)
+        ),
+    )
+    section = shown.locator("#downloads")
+    section.get_by_role("link", name=".spz").click()
+    expect(section.get_by_role("status")).to_contain_text("The disk is full.")
+    with shown.expect_download(timeout=WAIT):
+        section.get_by_role("link", name="compressed .ply").click()
+    expect(section.get_by_role("status").locator(".hint")).to_have_count(0, timeout=WAIT)
+    expect(section.get_by_role("status")).to_contain_text("The disk is full.")
 
 
 def test_a_phone_shows_the_whole_page(service: Up, model: SmallModel, open_window: Open) -> None:
