@@ -115,8 +115,10 @@ def walk(pages: dict[str, Page], http: httpx.Client, photos: list[Path]) -> None
             ("share", link),
         ):
             page.goto(address)
-            if name in ("model", "share", "report"):
+            if name in ("model", "share"):
                 page.wait_for_function(DRAWN, timeout=300_000, polling=500)
+            elif name == "report":
+                page.get_by_text("The model is finished.").wait_for()
             page.wait_for_timeout(1500)
             take(page, f"{name}-{theme}")
 
