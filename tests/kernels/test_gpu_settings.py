@@ -243,6 +243,40 @@ def test_trials_of_the_autotuner_leave_no_trace(last: bool, monkeypatch: pytest.
         assert kernel.best_config.kwargs == among[-1 if last else 0].kwargs
 
 
+@pytest.mark.parametrize(
+    ("pairs", "power"), [(0, 0), (1, 0), (15, 0), (16, 1), (65535, 3), (65536, 4), (2**31 - 1, 7)]
+)
+def test_a_magnitude_is_a_power_of_sixteen(pairs: int, power: int) -> None:
+    assert tuning.magnitude(pairs) == power
+
+
+@pytest.mark.skipif(DEVICE == "cuda", reason="on a device, the autotuner measures by itself")
+def test_what_was_fastest_on_short_lists_is_not_taken_for_long_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first setting is made to be the fastest at the first magnitude, and the last one at all others."""
+    kernels = {
+        composite.composite_kernel: tuning.COMPOSITE,
+        composite_backward.composite_backward_kernel: tuning.COMPOSITE_BACKWARD,
+    }
+    tried: dict[Any, int] = defaultdict(int)
+    for kernel, among in kernels.items():
+
+        def trial(call: Any, quantiles: Any, kernel: Any = kernel, count: int = len(among)) -> list[float]:
+            tried[kernel] += 1
+            return [float(tried[kernel] if tried[kernel] <= count else -tried[kernel])] * 3
+
+        use(monkeypatch, kernel, among)
+        monkeypatch.setitem(kernel.__dict__, "do_bench", trial)
+    chosen = []
+    for pairs in (7, 7, 70_000, 7):
+        for module in (composite, composite_backward):
+            monkeypatch.setattr(module, "magnitude", lambda _, pairs=pairs: tuning.magnitude(pairs))
+        differentiated("color")
+        chosen.append([kernel.best_config.kwargs for kernel in kernels])
+    first, last = ([among[place].kwargs for among in kernels.values()] for place in (0, -1))
+    assert chosen == [first, first, last, first]
+    assert list(tried.values()) == [2 * len(among) for among in kernels.values()]
+
+
 BRANCHES: dict[str, dict[str, set[Any]]] = {
     "project_kernel": {"USED": {1, 4, 9, 16}, "PLANAR": {True, False}, "ANTIALIAS": {True, False}},
     "color_backward_kernel": {"USED": {1, 4, 9, 16}, "PLANAR": {True, False}},

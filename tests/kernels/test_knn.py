@@ -13,7 +13,7 @@ from torch import Tensor
 
 from splatmill_worker.kernels import ops, reference
 from tests.support.kernels.bounds import at_most
-from tests.support.kernels.proof import EPS, backends, use
+from tests.support.kernels.proof import EPS, backends, use, where
 
 TINY = 2.0**-126
 
@@ -51,7 +51,7 @@ def exact(kind: str) -> Tensor:
 @pytest.mark.parametrize("kind", KINDS)
 def test_distance_is_the_definitions(kind: str, backend: str) -> None:
     points = _points(kind)
-    device = "cuda" if backend == "gpu" and torch.cuda.is_available() else "cpu"
+    device = where(backend)
     with use(backend) as op:
         got = ops.knn(points.to(device), backend=op).cpu().double()
     want = exact(kind)
@@ -93,7 +93,7 @@ def test_threads_and_order_do_not_show(backend: str) -> None:
 @pytest.mark.parametrize("backend", ["reference", *backends()])
 def test_no_points_give_no_distances(backend: str) -> None:
     with use(backend) as op:
-        assert ops.knn(torch.zeros(0, 3), backend=op).shape == (0,)
+        assert ops.knn(torch.zeros(0, 3, device=where(op)), backend=op).shape == (0,)
 
 
 @pytest.mark.parametrize("backend", ["reference", *backends()])
@@ -110,4 +110,4 @@ def test_no_points_give_no_distances(backend: str) -> None:
 )
 def test_bad_points_are_named(points: Tensor, backend: str) -> None:
     with use(backend) as op, pytest.raises((TypeError, ValueError), match=r"^points"):
-        ops.knn(points, backend=op)
+        ops.knn(points.to(where(op)), backend=op)

@@ -18,7 +18,7 @@ from splatmill_worker.kernels import ops, reference
 from splatmill_worker.kernels.cpu import isa
 from tests.support.kernels.alone import loss_units
 from tests.support.kernels.bounds import SUM_LIMIT, within
-from tests.support.kernels.proof import EPS, backends, use
+from tests.support.kernels.proof import EPS, backends, use, where
 
 SIZES = [(1, 1), (15, 16), (17, 257), (257, 1), (40, 33), (23, 1100)]
 
@@ -53,7 +53,7 @@ def test_loss_is_the_definitions(size: tuple[int, int], kind: str, masked: bool,
     want = color.double().requires_grad_()
     value = reference.loss(want, photo, mask=mask)
     (expected,) = torch.autograd.grad(value, want)
-    device = "cuda" if backend == "gpu" and torch.cuda.is_available() else "cpu"
+    device = where(backend)
     got = color.to(device).requires_grad_()
     with use(backend) as op:
         mine = ops.loss(got, photo.to(device), mask=None if mask is None else mask.to(device), backend=op)
@@ -104,7 +104,7 @@ def test_bright_pictures_keep_the_digits_of_their_differences(contrast: float, b
     if backend == "gpu":
         pytest.importorskip("triton", reason="Triton comes with torch's GPU builds; pip install triton")
     color, photo, value, exact, unit = nearly_learnt(contrast)
-    device = "cuda" if backend == "gpu" and torch.cuda.is_available() else "cpu"
+    device = where(backend)
     with use(backend) as op:
         mine, gradient = gradient_of(color.to(device), photo.to(device), op)
     off = (gradient.cpu() - exact).abs()
@@ -122,7 +122,7 @@ def test_what_a_mask_hides_does_not_matter(backend: str) -> None:
     hidden = mask == 0
     poisoned, other = color.clone(), photo.clone()
     poisoned[hidden], other[hidden] = float("nan"), 77
-    device = "cuda" if backend == "gpu" and torch.cuda.is_available() else "cpu"
+    device = where(backend)
     found = []
     with use(backend) as op:
         for c, p in ((color, photo), (poisoned, other)):
@@ -136,7 +136,7 @@ def test_what_a_mask_hides_does_not_matter(backend: str) -> None:
 @pytest.mark.parametrize("backend", ["reference", *backends()])
 def test_an_empty_mask_gives_zero(backend: str) -> None:
     color, photo = pair(20, 20)
-    device = "cuda" if backend == "gpu" and torch.cuda.is_available() else "cpu"
+    device = where(backend)
     leaf = color.to(device).requires_grad_()
     with use(backend) as op:
         value = ops.loss(

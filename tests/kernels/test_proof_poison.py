@@ -67,6 +67,13 @@ def drawn(case: Case, op: ops.Backend) -> Clean:
     return got, got.gradients(*weights(case))
 
 
+def same_sum(a: Tensor, b: Tensor) -> bool:
+    """Whether two gradients are equal: to the bit, or on a card, which sums in an order that varies, to rounding."""
+    if a.device.type == "cpu":
+        return torch.equal(a, b)
+    return torch.allclose(a, b, rtol=1e-4, atol=1e-5 * float(b.abs().max()))
+
+
 def assert_gone(bad: Run, without_it: Clean, case: Case, differentiate: bool) -> None:
     clean, want = without_it
     for field in bad.projected:
@@ -78,7 +85,7 @@ def assert_gone(bad: Run, without_it: Clean, case: Case, differentiate: bool) ->
     rows = torch.arange(len(bad.leaves["means"])) != VICTIM
     got = bad.gradients(*weights(case))
     for k in GROUPS:
-        assert torch.equal(got[k][rows], want[k]), k
+        assert same_sum(got[k][rows], want[k]), k
         assert (got[k][VICTIM] == 0).all(), k
     # Summed over blocks of sixteen, in which the others now stand elsewhere: equal but for rounding.
     assert torch.allclose(got["viewmat"], want["viewmat"], rtol=1e-4, atol=1e-5)

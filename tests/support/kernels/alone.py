@@ -23,7 +23,7 @@ from torch import Tensor
 from splatmill_worker.kernels import ops
 from splatmill_worker.kernels.records import Bins, Projected
 from tests.support.kernels.cases import GROUPS, Case
-from tests.support.kernels.proof import filled, weighted
+from tests.support.kernels.proof import filled, weighted, where
 from tests.support.kernels.units import DRAWS, moved_leaf
 
 Outputs = dict[str, Tensor]
@@ -63,7 +63,7 @@ def project_gradients(
     change: Change = lambda x: x,
 ) -> Outputs:
     """Gradients of the weighted fields to the five groups and the viewmat, with every input changed."""
-    device = "cuda" if op == "gpu" and torch.cuda.is_available() else "cpu"
+    device = where(op)
     named = zip((*GROUPS, "viewmat"), (*case.groups(dtype), case.viewmat.to(dtype)), strict=True)
     leaves = {k: moved_leaf(k, x, change).to(device).requires_grad_() for k, x in named}
     p = replace(case, K=change(case.K.to(dtype))).project([leaves[k] for k in GROUPS], leaves["viewmat"], op)
@@ -92,7 +92,7 @@ def composite_gradients(
     change: Change = lambda x: x,
 ) -> Outputs:
     """Gradients of the weighted images to the fields of `rounded`; its own lists where none are given."""
-    device = "cuda" if op == "gpu" and torch.cuda.is_available() else "cpu"
+    device = where(op)
     fields = [change(x.to(dtype)).to(device).requires_grad_() for x in rounded[:5]]
     p = filled(rounded, fields)
     lists = ops.bin(p, case.width, case.height, backend=op) if bins is None else bins

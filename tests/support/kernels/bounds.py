@@ -26,6 +26,13 @@ LENIENT = {
 }
 """Factors on LIMIT for single cases."""
 
+ON_A_CARD = {
+    # A card's 2^x may be off by two units in the last place where the processor's is off by one, and 1 - alpha has a
+    # thousand times that error where alpha is 0.999: measured 22.8 (a quaternion) on an H200.
+    "opaque and wide": 2.0,
+}
+"""Further factors for single cases whose tensors lie on a card."""
+
 measured: list[tuple[str, str, float]] = []
 """What was compared, in which case, and the worst row's share of what is allowed."""
 

@@ -34,6 +34,11 @@ def backends() -> list[object]:
     return found
 
 
+def where(op: str) -> str:
+    """The device that a backend's tensors lie on: a card for gpu where there is one, else the processor."""
+    return "cuda" if op == "gpu" and torch.cuda.is_available() else "cpu"
+
+
 @contextmanager
 def use(backend: str) -> Iterator[ops.Backend]:
     """Run with a backend, or with one build of the CPU engine (`cpu:avx2`); yields the backend's name as ops take it.
@@ -88,7 +93,7 @@ class Run:
 
 def run(case: Case, backend: ops.Backend, dtype: torch.dtype = torch.float32) -> Run:
     """Project, bin and composite a case."""
-    device = "cuda" if backend == "gpu" and torch.cuda.is_available() else "cpu"
+    device = where(backend)
     names = (*GROUPS, "viewmat", "background")
     tensors = [*case.groups(), case.viewmat, case.background]
     leaves = {

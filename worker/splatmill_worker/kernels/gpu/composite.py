@@ -26,7 +26,7 @@ from .device_functions.blend import (
     tile_pixels,
 )
 from .launch.argument import Floats, Int, Ints, Longs
-from .launch.tuning import COMPOSITE, autotune
+from .launch.tuning import COMPOSITE, autotune, magnitude
 from .record import (
     BLUE,
     DEPTH,
@@ -43,13 +43,13 @@ from .record import (
 )
 
 
-@autotune(COMPOSITE, key=["WITH_DEPTH", "CHECKPOINTS"])
-@triton.jit
+@autotune(COMPOSITE, key=["WITH_DEPTH", "CHECKPOINTS", "magnitude"])
+@triton.jit(do_not_specialize=["magnitude"])
 def composite_kernel(
     records: Floats, offsets: Longs, ids: Ints, background: Floats, color: Floats, transmittance: Floats,
     depth: Floats, checkpoints: Floats, first_segment: Ints, segment_tile: Ints, width: Int, height: Int, columns: Int,
-    BACKGROUND: tl.constexpr, WITH_DEPTH: tl.constexpr, CHECKPOINTS: tl.constexpr, SEGMENT: tl.constexpr,
-    BATCH: tl.constexpr,
+    magnitude: Int, BACKGROUND: tl.constexpr, WITH_DEPTH: tl.constexpr, CHECKPOINTS: tl.constexpr,
+    SEGMENT: tl.constexpr, BATCH: tl.constexpr,
 ):  # fmt: skip
     tl.static_assert(
         SEGMENT % BATCH == 0, "every segment starts with a batch, or its checkpoint is not written"
@@ -137,7 +137,7 @@ def blend(
         saved = torch.empty(segments, PLANES, TILE * TILE, **like)
     composite_kernel[(tiles,)](
         records, bins.offsets, bins.ids, background, color, transmittance, deep, saved, first, owner,
-        width, height, columns,
+        width, height, columns, magnitude(bins.ids.shape[0]),
         BACKGROUND=background is not None, WITH_DEPTH=depth, CHECKPOINTS=checkpoints, SEGMENT=SEGMENT,
     )  # fmt: skip
     return Blended(color, transmittance, deep, saved, first, owner)

@@ -22,7 +22,7 @@ from .device_functions.blend import (
 )
 from .device_functions.projection import LN2
 from .launch.argument import Floats, Int, Ints, Longs
-from .launch.tuning import COMPOSITE_BACKWARD, autotune
+from .launch.tuning import COMPOSITE_BACKWARD, autotune, magnitude
 from .record import (
     BLUE,
     DEPTH,
@@ -52,12 +52,12 @@ def pick(k, which: tl.constexpr, value, others):
     return tl.where(k == which, value, others)
 
 
-@autotune(COMPOSITE_BACKWARD, key=["WITH_DEPTH"], reset=["gradient"])
-@triton.jit
+@autotune(COMPOSITE_BACKWARD, key=["WITH_DEPTH", "magnitude"], reset=["gradient"])
+@triton.jit(do_not_specialize=["magnitude"])
 def composite_backward_kernel(
     records: Floats, offsets: Longs, ids: Ints, color: Floats, transmittance: Floats, depth: Floats,
     checkpoints: Floats, first_segment: Ints, segment_tile: Ints, d_color: Floats, d_alpha: Floats, d_depth: Floats,
-    gradient: Floats, width: Int, height: Int, columns: Int,
+    gradient: Floats, width: Int, height: Int, columns: Int, magnitude: Int,
     WITH_ALPHA: tl.constexpr, WITH_DEPTH: tl.constexpr, SEGMENT: tl.constexpr, BATCH: tl.constexpr,
 ):  # fmt: skip
     segment = tl.program_id(0)
@@ -168,7 +168,7 @@ def blend_backward(
         made.first_segment, made.segment_tile, d_color.contiguous(),
         None if d_alpha is None else d_alpha.contiguous(),
         None if d_depth is None else d_depth.contiguous(), gradient,
-        width, height, -(-width // TILE),
+        width, height, -(-width // TILE), magnitude(bins.ids.shape[0]),
         WITH_ALPHA=d_alpha is not None, WITH_DEPTH=d_depth is not None, SEGMENT=SEGMENT,
     )  # fmt: skip
     return gradient

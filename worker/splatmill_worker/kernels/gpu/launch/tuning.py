@@ -1,4 +1,7 @@
-"""Launch settings that the autotuner chooses from. It measures once per kernel and GPU and keeps the result on disk."""
+"""Launch settings that the autotuner chooses from.
+
+It measures once per kernel, GPU and magnitude of the lists, and keeps the result on disk.
+"""
 
 from __future__ import annotations
 
@@ -24,13 +27,22 @@ COMPOSITE_BACKWARD = [
 ]
 
 
+def magnitude(pairs: int) -> int:
+    """Return the power of 16 that the length of a view's lists reaches: settings are measured anew for each.
+
+    What is fastest on the few pairs of a thumbnail is not so on millions. Both kernels that walk the lists take this
+    number for the autotuner alone.
+    """
+    return (max(pairs, 1).bit_length() - 1) // 4
+
+
 def autotune(
     configs: Sequence[triton.Config],
     key: Sequence[str],
     *,
     reset: Sequence[str] = (),
 ) -> Callable[[Any], Any]:
-    """Return Triton's autotuner with results on disk; `key` names the constants that a result depends on.
+    """Return Triton's autotuner with results on disk; `key` names the arguments that a result depends on.
 
     reset: arrays that the kernel adds to (they may be None), set to 0 before each trial and before the launch itself;
     what such an array holds before the launch is lost. Under the interpreter the first setting is taken, since times
