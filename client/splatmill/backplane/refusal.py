@@ -46,7 +46,7 @@ class RefusalAwareRedis(redis.Redis):
     """A client that raises RedisRefuses for refusals."""
 
     def execute_command(self, *args: Any, **options: Any) -> Any:
-        with _refusals():
+        with refusals():
             return super().execute_command(*args, **options)  # type: ignore[no-untyped-call]  # redis leaves it untyped
 
     def pipeline(self, transaction: bool = True, shard_hint: str | None = None) -> Pipeline:
@@ -56,11 +56,11 @@ class RefusalAwareRedis(redis.Redis):
 
 class _Pipeline(Pipeline):
     def execute(self, raise_on_error: bool = True) -> list[Any]:
-        with _refusals():
+        with refusals():
             return super().execute(raise_on_error)
 
     def immediate_execute_command(self, *args: Any, **options: Any) -> Any:
-        with _refusals():
+        with refusals():
             return super().immediate_execute_command(*args, **options)  # type: ignore[no-untyped-call]  # redis leaves it untyped
 
 
@@ -76,7 +76,8 @@ def code_of(error: redis.ResponseError) -> str | None:
 
 
 @contextmanager
-def _refusals() -> Iterator[None]:
+def refusals() -> Iterator[None]:
+    """Raise RedisRefuses for refusals in the block."""
     try:
         yield
     except RedisRefuses:

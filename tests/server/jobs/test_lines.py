@@ -3,6 +3,7 @@
 Workers are played. Not proved here: that the project's worker takes entries in this way (tests/worker/service).
 """
 
+import socket
 from typing import Any
 
 import pytest
@@ -14,6 +15,7 @@ from hypothesis import strategies as st
 from splatmill.backplane import keys
 from splatmill.backplane.queue import entries, leases, lines, queue, rq_keys, workers
 from splatmill.backplane.queue.lines import LINES, Line
+from splatmill.backplane.refusal import RedisRefuses
 from splatmill.schema import Backend, TrainOptions
 from splatmill_server.jobs import queue_places
 from splatmill_server.jobs.queue_places import start_after
@@ -274,3 +276,22 @@ def test_many_workers_are_not_read_for_each_job_that_waits(
     with counted() as operations:
         assert jobs.get(job_id).queue_position == 0
     assert operations.round_trips == 2, "the job, and its place in the queue"
+
+
+def test_a_wait_ends_by_an_entry_or_a_socket_and_leaves_no_reply_behind(connection: redis.Redis) -> None:
+    """A wait of 0 seconds has no end of its own."""
+    wake, other_end = socket.socketpair()
+    with wake, other_end:
+        submit(connection, "a0")
+        lines.sort(connection)
+        lines.wait(connection, LINES, 0, wake)
+        assert drain(connection) == ["a0"]
+        other_end.send(b"x")
+        for key in map(keys.bell, LINES):
+            connection.delete(key)
+        lines.wait(connection, LINES, 0, wake)
+        assert connection.ping()
+        connection.execute_command("ACL", "SETUSER", "default", "-blpop")
+        wake.recv(1)
+        with pytest.raises(RedisRefuses, match="NOPERM"):
+            lines.wait(connection, LINES, 0, wake)

@@ -9,6 +9,7 @@ The parent must import neither torch nor pycolmap: their threads and locks do no
 import os
 import select
 import signal
+import socket
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -20,7 +21,7 @@ import redis
 from redis.client import Pipeline
 from rq import Queue, Worker
 from rq.command import parse_payload
-from rq.exceptions import NoSuchJobError
+from rq.exceptions import NoSuchJobError, StopRequested
 from rq.executions import Execution
 from rq.job import Job, JobStatus
 from rq.utils import now
@@ -129,6 +130,9 @@ class AttemptWorker(Worker):
         self._lock: JobLock | None = None
         self._saved: SavedProgress | None = None
         self._kill_at: float | None = None
+        self._stop_reported = False
+        self._wake: socket.socket | None = None
+        self._wake_end: socket.socket | None = None
         self._superseded = False
         self._remove_at = 0.0
 
@@ -158,6 +162,7 @@ class AttemptWorker(Worker):
         self.set_state(WorkerStatus.SUSPENDED)
         while shortage_text():
             time.sleep(_SPACE_SECONDS)
+            self._end_if_stopping()
             self.heartbeat()
         self.set_state(WorkerStatus.IDLE)
         self.log.info("Worker %s: takes jobs again", self.name)
@@ -169,11 +174,17 @@ class AttemptWorker(Worker):
             self.log.warning("Worker %s: stops, which Redis does not know: %s", self.name, error)
 
     def teardown(self) -> None:
+        if self._stop_requested:
+            self.log.info("Worker %s: stops on request", self.name)
         try:
             super().teardown()  # type: ignore[no-untyped-call]  # RQ leaves it untyped
         except redis.RedisError as error:
             # The record expires by itself.
             self.log.warning("Worker %s: its record stays in Redis: %s", self.name, error)
+        signal.set_wakeup_fd(-1)
+        for end in (self._wake, self._wake_end):
+            if end is not None:
+                end.close()
 
     def register_birth(self) -> None:
         super().register_birth()  # type: ignore[no-untyped-call]  # rq lacks types here and below
@@ -265,8 +276,27 @@ class AttemptWorker(Worker):
             with suppress(ProcessLookupError, PermissionError):
                 os.killpg(self.horse_pid, sig)
 
+    # A signal handler can interrupt any line, with any lock held. So the handlers write neither to the log nor to
+    # Redis, and raise nothing: redis-py drops exceptions in what it does around each command, and hiredis crashes on
+    # one while it packs a number. They set fields, which each loop reads. Python writes to `_wake_end`, which ends a
+    # wait.
+
+    def _install_signal_handlers(self) -> None:
+        self._wake, self._wake_end = socket.socketpair()
+        self._wake_end.setblocking(False)
+        signal.set_wakeup_fd(self._wake_end.fileno(), warn_on_full_buffer=False)
+        super()._install_signal_handlers()  # type: ignore[no-untyped-call]  # RQ leaves it untyped
+
+    def request_stop(self, signum: int, frame: FrameType | None) -> None:
+        """Note that the worker shall stop, and ask the attempt to save its state."""
+        self._shutdown_requested_date = now()
+        signal.signal(signal.SIGINT, self.request_force_stop)
+        signal.signal(signal.SIGTERM, self.request_force_stop)
+        self._stop_requested = True
+        self.handle_warm_shutdown_request()
+
     def handle_warm_shutdown_request(self) -> None:
-        super().handle_warm_shutdown_request()  # type: ignore[no-untyped-call]  # RQ leaves it untyped
+        """Ask the attempt, if one runs, to save its state and end. It is killed at the end of the grace period."""
         if self.horse_pid:
             self._kill_at = time.monotonic() + self._grace
             with suppress(ProcessLookupError):
@@ -278,6 +308,18 @@ class AttemptWorker(Worker):
             return  # one Ctrl-C may arrive twice, from the terminal and from a supervisor
         self._kill_at = time.monotonic()
         self.kill_horse()
+
+    def _end_if_stopping(self) -> None:
+        """End a worker that holds no entry, if it was told to stop."""
+        if self._stop_requested:
+            raise StopRequested
+
+    def _report_stop(self) -> None:
+        """Log that the worker will stop after the running attempt, and note it in the worker's record, once."""
+        if self._stop_requested and not self._stop_reported:
+            self._stop_reported = True
+            self.log.info("Worker %s: stops after the attempt at %s", self.name, self._entry_id)
+            self.set_shutdown_requested_date()
 
     def unsubscribe(self) -> None:
         """Stop listening for commands. RQ would wait a second for the thread, which ends with this process anyway."""
@@ -294,26 +336,29 @@ class AttemptWorker(Worker):
         return (job, self.queues[0]) if job is not None else None
 
     def _next(self, *, wait: bool) -> Job | None:
+        self._end_if_stopping()
         self.set_state(WorkerStatus.IDLE)
         while True:
             self.heartbeat()
+            self._end_if_stopping()
             if self.should_run_maintenance_tasks:
                 self.run_maintenance_tasks()
             self._wait_for_space()
+            self._end_if_stopping()
             job = self._take()
             if job is not None or not wait:
                 return job
-            lines.wait(self.connection, self._served, _IDLE_SECONDS)
+            self._end_if_stopping()
+            lines.wait(self.connection, self._served, _IDLE_SECONDS, self._wake)
+            self._end_if_stopping()
 
     def _take(self) -> Job | None:
-        with _blocked_signals():
-            # A signal to stop an idle worker raises an exception, which would lose the entry on its way.
-            taken = lines.take(self.connection, self.name, self._served)
-            if taken is None:
-                return None
-            lease, self._line = taken
-            self.execution = Execution(lease.execution, lease.entry, self.connection, self.name)
-            self.set_state(WorkerStatus.BUSY)
+        taken = lines.take(self.connection, self.name, self._served)
+        if taken is None:
+            return None
+        lease, self._line = taken
+        self.execution = Execution(lease.execution, lease.entry, self.connection, self.name)
+        self.set_state(WorkerStatus.BUSY)
         try:
             job = AttemptEntry.fetch(lease.entry, connection=self.connection, serializer=entries.SERIALIZER)
         except (ValueError, NoSuchJobError) as error:
@@ -357,6 +402,7 @@ class AttemptWorker(Worker):
                     os.setpgid(0, 0)
                     die_with_parent(parent)
                     die_first()
+                    signal.set_wakeup_fd(-1)
                     hand_back.install_signal_handlers()
                     signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
                     self._run_child(job, queue)
@@ -428,6 +474,7 @@ class AttemptWorker(Worker):
                 pid, status, usage = os.wait4(self.horse_pid, os.WNOHANG)
                 if pid:
                     return status, usage
+                self._report_stop()
                 if time.monotonic() >= beat_at:
                     beat_at = time.monotonic() + entries.MONITORING_INTERVAL
                     self._heartbeat(job)
@@ -499,7 +546,8 @@ class AttemptWorker(Worker):
     def _until_redis_works(self, action: Callable[[], T]) -> T:
         """Return the result of `action`, which is repeated while Redis cannot be reached or refuses.
 
-        There is no limit: nothing is computed meanwhile, and the log says what the worker waits for.
+        There is no limit: nothing is computed meanwhile, and the log says what the worker waits for. A worker that
+        holds no entry raises StopRequested once it is told to stop.
         """
         log_at = 0.0
         while True:
@@ -509,12 +557,16 @@ class AttemptWorker(Worker):
                 if time.monotonic() >= log_at:
                     log_at = time.monotonic() + _LOG_SECONDS
                     self.log.warning("Worker %s: waiting for Redis: %s", self.name, error)
+                if self.get_state() != WorkerStatus.BUSY:
+                    self._end_if_stopping()
                 time.sleep(_RETRY_SECONDS)
 
 
 @contextmanager
 def _blocked_signals() -> Iterator[None]:
-    """Delay the signals that a worker handles until the end of the block."""
+    """Keep the signals that a worker handles from this thread, and from the process that it forks, until the end of the
+    block. Another thread may receive them meanwhile; the worker's handlers then run here all the same.
+    """
     signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
     try:
         yield

@@ -12,6 +12,8 @@ at any moment leaves it in its line or under a lease, which expires.
 """
 
 import logging
+import select
+import socket
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, cast, get_args
@@ -23,6 +25,7 @@ from splatmill.backplane import keys
 from splatmill.backplane.queue import line_scripts as scripts
 from splatmill.backplane.queue.entries import KEEP_FINISHED
 from splatmill.backplane.queue.leases import LEASE, Lease
+from splatmill.backplane.refusal import refusals
 
 Line = Literal["any", "cpu", "gpu"]
 """What a job asks of its worker, by its option `backend`. `any`: auto. `cpu`: cpu or reference. `gpu`: a usable GPU."""
@@ -88,9 +91,35 @@ def take(connection: redis.Redis, worker: str, served: Sequence[Line]) -> tuple[
     return Lease(answer[1].decode(), execution), cast(Line, answer[2].decode())
 
 
-def wait(connection: redis.Redis, served: Sequence[Line], seconds: float) -> None:
-    """Wait until an entry comes to one of these lines, at most for this time. Another worker may take it first."""
-    connection.blpop([keys.bell(line) for line in served], cast(int, seconds))
+def wait(
+    connection: redis.Redis, served: Sequence[Line], seconds: float, wake: socket.socket | None = None
+) -> None:
+    """Wait until an entry comes to one of these lines, at most for this time. Another worker may take it first.
+
+    wake: a socket that ends the wait once it is readable.
+    """
+    bells = [keys.bell(line) for line in served]
+    if wake is None:
+        connection.blpop(bells, cast(int, seconds))
+        return
+    pool = connection.connection_pool
+    held: Any = pool.get_connection()
+    try:
+        held.send_command("BLPOP", *bells, seconds)
+        own = held._get_socket()
+        poll = select.poll()
+        poll.register(own, select.POLLIN)
+        poll.register(wake, select.POLLIN)
+        if own.fileno() in dict(poll.poll()):
+            with refusals():
+                held.read_response()
+        else:
+            held.disconnect()  # the reply is still to come
+    except BaseException:
+        held.disconnect()
+        raise
+    finally:
+        pool.release(held)
 
 
 def sort(connection: redis.Redis) -> None:
