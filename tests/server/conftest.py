@@ -14,6 +14,7 @@ from structlog.testing import CapturingLogger
 from splatmill.backplane.connection import connect
 from splatmill_server.base.settings import Settings
 from tests.support.redis_server import empty_redis
+from tests.support.redis_server import redis_server as redis_server
 from tests.support.served_app import Serve, ServedApp, served_app
 
 

@@ -1,6 +1,7 @@
 """A real Redis of a test's own. A conftest.py that imports `redis_server` or `connection` offers them as fixtures."""
 
 import shutil
+import signal
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -34,6 +35,16 @@ class RedisServer:
         assert self._process is not None
         self._process.kill()
         self._process.wait(60)
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Keep it from answering. Its connections stay."""
+        assert self._process is not None
+        self._process.send_signal(signal.SIGSTOP)
+        try:
+            yield
+        finally:
+            self._process.send_signal(signal.SIGCONT)
 
     def _answers(self) -> bool:
         try:

@@ -13,6 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from splatmill.backplane import keys
+from splatmill.backplane.connection import connect
 from splatmill.backplane.queue import entries, leases, lines, queue, rq_keys, workers
 from splatmill.backplane.queue.lines import LINES, Line
 from splatmill.backplane.refusal import RedisRefuses
@@ -21,6 +22,7 @@ from splatmill_server.jobs import queue_places
 from splatmill_server.jobs.queue_places import start_after
 from tests.support.jobs import write_row
 from tests.support.queue_entries import take, waiting
+from tests.support.redis_server import RedisServer
 from tests.support.served_app import ServedApp
 
 
@@ -295,3 +297,13 @@ def test_a_wait_ends_by_an_entry_or_a_socket_and_leaves_no_reply_behind(connecti
         wake.recv(1)
         with pytest.raises(RedisRefuses, match="NOPERM"):
             lines.wait(connection, LINES, 0, wake)
+
+
+def test_a_wait_ends_where_redis_answers_no_more(redis_server: RedisServer) -> None:
+    wake, other_end = socket.socketpair()
+    connection = connect(redis_server.url, timeout=0.2)
+    with wake, other_end, connection:
+        connection.ping()
+        with redis_server.paused(), pytest.raises(redis.TimeoutError, match="no answer to BLPOP"):
+            lines.wait(connection, LINES, 1, wake)
+        assert connection.ping()

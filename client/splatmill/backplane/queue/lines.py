@@ -97,6 +97,8 @@ def wait(
     """Wait until an entry comes to one of these lines, at most for this time. Another worker may take it first.
 
     wake: a socket that ends the wait once it is readable.
+
+    Raises redis.TimeoutError if Redis has not answered when the connection's timeout has passed after that time.
     """
     bells = [keys.bell(line) for line in served]
     if wake is None:
@@ -110,7 +112,11 @@ def wait(
         poll = select.poll()
         poll.register(own, select.POLLIN)
         poll.register(wake, select.POLLIN)
-        if own.fileno() in dict(poll.poll()):
+        limited = seconds and held.socket_timeout  # a wait of 0 seconds has no end
+        ready = dict(poll.poll(1000 * (seconds + held.socket_timeout) if limited else None))
+        if not ready:
+            raise redis.TimeoutError(f"no answer to BLPOP {held.socket_timeout:g} seconds after its end")
+        if own.fileno() in ready:
             with refusals():
                 held.read_response()
         else:
