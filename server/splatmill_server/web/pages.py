@@ -205,14 +205,14 @@ def import_map(root: str) -> str:
 
 def _asset(request: Request, tree: Tree, digest: str, name: str) -> Response:
     """Return a file of a tree: for ever under its digest; a page of another version gets it too, but for once."""
-    file = tree.find(name)
+    current, file = tree.is_current(digest), tree.find(name)
     if file is None:
         raise ProblemError("not_found", f"There is nothing at {request.url.path}.")
     packed = file.packed if _accepts_gzip(request) else None
     etag = f'"{file.etag}-gzip"' if packed is not None else f'"{file.etag}"'
     headers = {
         "ETag": etag,
-        "Cache-Control": _FOREVER if digest == tree.digest else "no-cache",
+        "Cache-Control": _FOREVER if current else "no-cache",
         "Content-Type": file.media_type,
         "Vary": "Accept-Encoding",
         # A worker or a frame made of this file is held to the same rules.

@@ -108,7 +108,26 @@ def test_a_changed_file_has_another_address(tmp_path) -> None:
     assert tree.names() == ["a.css"]
     (tmp_path / "a.css").write_text("a { color: red }")
     assert tree.digest != first
+    assert not tree.is_current(first)
+    assert tree.is_current(tree.digest)
     assert Tree(tmp_path / "absent").names() == []
+
+
+def test_the_folder_is_looked_at_for_another_digest_and_not_for_each_file(tmp_path) -> None:
+    """A page of a process that has seen a changed file gets the new one from a process that has not."""
+    (tmp_path / "below").mkdir()
+    (tmp_path / "below/a.css").write_text("a {}")
+    tree = Tree(tmp_path)
+    first = tree.digest
+    (tmp_path / "below/a.css").write_text("a { color: red }")
+    assert tree.is_current(first), "the files as they were read"
+    before = tree.find("below/a.css")
+    assert tree.is_current(Tree(tmp_path).digest)
+    after = tree.find("below/a.css")
+    assert before is not None
+    assert after is not None
+    assert before.etag != after.etag
+    assert tree.names() == ["below/a.css"]
 
 
 def test_without_the_packages_pages_say_what_is_missing(app: ServedApp, tmp_path, monkeypatch) -> None:
