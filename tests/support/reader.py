@@ -26,9 +26,11 @@ END = "\x04"
 """What the shell prints after a block that has run to its end."""
 
 SMALLER = (
-    # Budgets of one second, and photos of 120 pixels.
+    # Budgets of one second, and photos of 120 pixels. So small photos need the highest effort for their cameras: asked
+    # for, it is not tried after the two others.
+    (r"^(splatmill train .*)--time-budget \S+", r"\1--time-budget 1s --sfm-effort high"),
     (r"--time-budget \S+", "--time-budget 1s"),
-    (r'time_budget("?[=:] ?)"\d[^"]*"', r'time_budget\1"1s"'),
+    (r'time_budget("?)([=:] ?)"\d[^"]*"', r'time_budget\1\2"1s", \1sfm_effort\1\2"high"'),
     (r"--steps \d+", "--steps 20"),
     (r"\bsteps=\d+", "steps=60"),
     (r"--image-size \d+", "--image-size 120"),
@@ -36,12 +38,13 @@ SMALLER = (
     (r"\bin range\(100\)", "in range(20)"),
     (r"\bin range\(1, 101\)", "in range(1, 21)"),
     # A command without a budget gets one, so that it ends.
-    (r"(splatmill train (?!.*(?:--time-budget|--steps|--help)).+)", r"\1 --time-budget 1s"),
+    (r"(splatmill train (?!.*(?:--time-budget|--steps|--help)).+)", r"\1 --time-budget 1s --sfm-effort high"),
     # `make demo` writes into this folder instead of the repository's, without a video, from photos that are there.
     (
         r"^make demo$",
         'mkdir demo; cp -r photos demo; make -s -o .venv/.installed -C "$ROOT" demo '
-        'OUT="$PWD/demo" PHOTOS="$PWD/demo/photos" ARGS="--novel-view --time-budget 1s --image-size 120"',
+        'OUT="$PWD/demo" PHOTOS="$PWD/demo/photos" '
+        'ARGS="--novel-view --time-budget 1s --image-size 120 --sfm-effort high"',
     ),
     (r"^(splatmill clean .*--capture photos)", r"\1 --image-size 60"),
     # The port of the documentation may be in use here; the address is replaced when the service is up.
