@@ -9,6 +9,7 @@ launches, which the autotuner times, do wait.
 from __future__ import annotations
 
 import gc
+import warnings
 from typing import Any
 
 import pytest
@@ -120,6 +121,23 @@ def test_a_host_that_runs_ahead_waits_for_a_step_long_past(
 def test_the_check_notices_what_waits(sin: Any) -> None:
     with pytest.raises(AssertionError, match="wait"), nothing_waits():
         sin(torch.ones(3))
+
+
+def test_the_check_ends_though_torch_warns_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A device is played. Left in that mode, it would fail all tests that come after in the process."""
+    modes: list[Any] = [0]
+
+    def choose(mode: Any) -> None:
+        modes.append(mode)
+        if len(modes) == 2:
+            warnings.warn("Synchronization debug mode is a prototype feature and does not yet", stacklevel=1)
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "get_sync_debug_mode", lambda: modes[-1])
+    monkeypatch.setattr(torch.cuda, "set_sync_debug_mode", choose)
+    with nothing_waits():
+        assert modes == [0, "error"]
+    assert modes == [0, "error", 0]
 
 
 @pytest.mark.parametrize("room", [Room(1, 1), Room(3, 10**6), Room(10**6, 2), None])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import pkgutil
+import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -120,15 +121,24 @@ def nothing_waits() -> Iterator[None]:
     """Fail at whatever would make the host wait for a device: in the interpreter by what torch is called for, on a
     device by torch's own check of synchronisations as well.
     """
-    before = torch.cuda.get_sync_debug_mode() if torch.cuda.is_available() else 0
-    if torch.cuda.is_available():
-        torch.cuda.set_sync_debug_mode("error")
+    with _no_synchronisation(), _NoWaitingCalls(), _NoWaitingOperations():
+        yield
+
+
+@contextmanager
+def _no_synchronisation() -> Iterator[None]:
+    """Have torch raise at a synchronisation with a device, where there is one."""
+    if not torch.cuda.is_available():
+        yield
+        return
+    before = torch.cuda.get_sync_debug_mode()
     try:
-        with _NoWaitingCalls(), _NoWaitingOperations():
-            yield
+        with warnings.catch_warnings():  # it warns, once in a process, after the mode is set
+            warnings.filterwarnings("ignore", "Synchronization debug mode is a prototype feature")
+            torch.cuda.set_sync_debug_mode("error")
+        yield
     finally:
-        if torch.cuda.is_available():
-            torch.cuda.set_sync_debug_mode(before)
+        torch.cuda.set_sync_debug_mode(before)
 
 
 class LateDevice:
