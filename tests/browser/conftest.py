@@ -197,6 +197,13 @@ class Visit:
     watched: Watched
 
 
+def requests(page: Page) -> list[str]:
+    """Methods and addresses of what a page asks for, one line each, filled as it does."""
+    asked: list[str] = []
+    page.on("request", lambda request: asked.append(f"{request.method} {request.url}"))
+    return asked
+
+
 Open = Callable[..., Visit]
 """Opens a window on a service: `open_window(up, color_scheme="dark", viewport=...)`."""
 

@@ -21,7 +21,7 @@ import pytest
 from PIL import Image
 from playwright.sync_api import Page, Route, expect
 
-from tests.browser.conftest import Open, SmallModel, Visit
+from tests.browser.conftest import Open, SmallModel, Visit, requests
 from tests.support import still_life
 from tests.support.up import Up
 
@@ -180,6 +180,7 @@ def test_a_whole_job_is_watched_from_its_beginning_to_its_model(
     page = open_window(service, viewport={"width": 800, "height": 500}).page
     job_id = submit(service, capture, time_budget="15s")
     page.add_init_script(NOTIFICATIONS)
+    asked = requests(page)
     page.goto(f"/jobs/{job_id}")
     page.get_by_role("button", name="Notify me when it ends").click()
     expect(page.get_by_role("button", name="Notify me when it ends")).to_have_attribute(
@@ -189,6 +190,8 @@ def test_a_whole_job_is_watched_from_its_beginning_to_its_model(
 
     expect(page.locator("#state")).to_have_text("Finished")
     assert page.evaluate("notified") == ["watched: Finished."]
+    of_small_file = [line.split()[0] for line in asked if line.endswith(f"{job_id}/download/sog")]
+    assert of_small_file == ["HEAD"], "it is made before the model's page asks for it"
     expect(page.locator("#left")).to_be_empty()
     link = page.get_by_role("link", name="Open the model")
     expect(link).to_have_attribute("href", f"/models/{job_id}")

@@ -1,14 +1,14 @@
 // A stored model in the viewer: its picture at once, and then the model from the smallest file that the viewer draws.
 
-import { get, request } from "./api.js";
+import { get } from "./api.js";
 import { POSTER, PREVIEW, pictureOf } from "./picture.js";
+import { SMALL_FORMAT, makeSmallFile, smallFile } from "./small_file.js";
 import { open } from "./viewer.js";
 
 /** Bytes of a model.ply that is loaded as it is: a smaller file of it would hardly be seen sooner. */
 const SMALL = 200e3;
-
-/** The format with the fewest bytes among those that the viewer draws; it costs about 0.03 dB. */
-const SMALLEST = "sog";
+/** Milliseconds that are waited without a word. */
+const SOON = 1000;
 
 /**
  * Show a model in an element, which needs a size of its own.
@@ -18,10 +18,9 @@ const SMALLEST = "sog";
  * @param {{name: string}[]} model.files
  * @param {any[]} model.cameras those of the photos
  * @param {import("./viewer/presented.js").Presentation} model.presentation how its owner wants it to be shown
- * @param {boolean} [model.waits] whether to wait until the server has made the smallest file, where it has not yet
  * @param {import("./viewer.js").Options} options others than those for the source and the cameras
  */
-export function openModel(box, { address, files, cameras, presentation, waits = false }, options) {
+export function openModel(box, { address, files, cameras, presentation }, options) {
   // The worker takes the picture from where the first held-out photo was taken, or else the first photo of all.
   const first = (cameras.find(({ split }) => split === "test") ?? cameras[0])?.camera;
   const picture = pictureOf(files);
@@ -35,33 +34,37 @@ export function openModel(box, { address, files, cameras, presentation, waits = 
     cameras: cameras.map(({ camera }) => camera),
     camera,
     poster,
-    find: (say) => smallest(address, waits, say),
+    find: (say, begun) => smallest(address, say, begun),
   });
 }
 
 /**
- * The file of a model to load.
- * @param {string} address @param {boolean} waits @param {(text: string) => void} say
+ * The file of a model to load. Where the server still has to make the smallest one, it is waited for, but no longer than
+ * model.ply would take to load: so the scene is there in at most twice the time of the better choice.
+ * @param {string} address @param {(text: string) => void} say
+ * @param {Promise<unknown>} begun settles once the viewer's engine and the picture are loaded, which shows how fast files come
  * @returns {Promise<import("./viewer/source.js").Source>}
  */
-async function smallest(address, waits, say) {
+async function smallest(address, say, begun) {
   const whole = { url: `${address}/files/model.ply` };
   /** @type {any[]} */
   const formats = (await get(`${address}/formats`)).formats;
   const size = (/** @type {string} */ wanted) => formats.find(({ format }) => format === wanted)?.bytes ?? null;
-  const small = { url: `${address}/download/${SMALLEST}` };
   if (size("ply") <= SMALL) return whole;
-  if (size(SMALLEST) !== null) return small;
-  const made = request("HEAD", small.url);
-  if (!waits) {
-    made.catch(() => {}); // it is for the next visit
-    return whole;
-  }
-  say("The server makes a small file of the model, once for all visitors.");
-  try {
-    await made;
-    return small;
-  } catch {
-    return { ...whole, what: "the whole model, since the server could not make a small file of it" };
-  }
+  if (size(SMALL_FORMAT) !== null) return { url: smallFile(address) };
+  const made = makeSmallFile(address);
+  await begun;
+  const patience = size("ply") / speed();
+  if (patience > SOON) say("The server makes a small file of the model, once for all visitors.");
+  return Promise.race([
+    made.then((is) => is ? { url: smallFile(address) } : { ...whole, what: "the whole model, since the server could not make a small file of it" }),
+    new Promise((resolve) => setTimeout(resolve, patience)).then(() => whole), // what is made is for the next visit
+  ]);
+}
+
+/** Bytes per millisecond with which the largest file came that this page has loaded, or Infinity where all were at hand. */
+function speed() {
+  const files = /** @type {PerformanceResourceTiming[]} */ (performance.getEntriesByType("resource"));
+  const largest = files.reduce((most, file) => file.transferSize > (most?.transferSize ?? 0) ? file : most, files[0]);
+  return largest?.transferSize ? largest.transferSize / (largest.responseEnd - largest.responseStart) : Infinity;
 }

@@ -1,10 +1,11 @@
 // The dialog that makes, shows and revokes links to a model.
 
 import { at, isLoopback } from "./address.js";
-import { get, request, send } from "./api.js";
+import { get, send } from "./api.js";
 import { h } from "./dom.js";
 import { moment } from "./format.js";
 import { noticeOf } from "./shell.js";
+import { makeSmallFile } from "./small_file.js";
 
 const TERMS = [["1d", "1 day"], ["7d", "7 days"], ["30d", "30 days"], ["365d", "1 year"]];
 
@@ -64,7 +65,7 @@ export async function openSharing(address, name) {
     event.preventDefault();
     void tried(async () => {
       const share = await send("POST", `${address}/shares`, { expires_in: term.value, name: label.value.trim() || null, photos: photos.checked });
-      request("HEAD", `${address}/download/sog`).catch(() => {}); // what visitors load is made before they come
+      void makeSmallFile(address); // before visitors come
       made.replaceChildren(link(`${location.origin}${at(share.path)}`, name));
       made.scrollIntoView({ block: "nearest" });
       label.value = "";

@@ -42,8 +42,8 @@ const TURN_MS = 350;
 /**
  * @typedef {Object} Options
  * @property {string} [url]  address of a file of splats: .ply, compressed .ply or .sog
- * @property {(say: (text: string) => void) => Promise<Source>} [find]  finds the file while the engine is loaded, in place
- *   of an address
+ * @property {(say: (text: string) => void, begun: Promise<unknown>) => Promise<Source>} [find]  finds the file, in place of an
+ *   address; `begun` settles once the engine and the picture are loaded
  * @property {ArrayBuffer | Uint8Array} [bytes]  its bytes, in place of an address
  * @property {string} [model]  address of a stored model, as /v1/models/{id}: the server renders it where there is no WebGL
  * @property {Camera[]} [cameras]  of the photos: they tell where up is, where to look, and how far away to be. Without
@@ -183,14 +183,16 @@ export class View extends EventTarget {
       this.say("Loading the viewer");
       try {
         if (!hasWebGL()) throw new ViewerError("no_webgl", "This browser has no WebGL, which drawing in 3D needs.");
-        source = options.find?.((text) => this.say(text));
-        source?.catch(() => {}); // it is waited for below, unless the engine fails first
-        this.surface = await Splats.open(this.canvas, {
+        const engine = Splats.open(this.canvas, {
           antialias: options.antialias,
           background: options.background === "white" ? [1, 1, 1] : [0, 0, 0],
           again: () => this.again(),
           drawn: () => this.poster.remove(),
         });
+        const begun = Promise.allSettled([engine, options.poster ? this.poster.decode() : null]);
+        source = options.find?.((text) => this.say(text), begun);
+        source?.catch(() => {}); // it is waited for below, unless the engine fails first
+        this.surface = await engine;
       } catch (error) {
         if (!(error instanceof ViewerError) || !options.model) throw error;
         this.whyNot = `${error.message} The server renders pictures instead.`;

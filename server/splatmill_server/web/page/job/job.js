@@ -9,6 +9,7 @@ import { CANCELLING, FINAL, badgeKind, badgeText } from "../job_states.js";
 import { labelButton, starButton, tagLinks } from "../labels.js";
 import { titleOf } from "../new/titles.js";
 import { confirmAction, noticeOf, notify, startShell } from "../shell.js";
+import { makeSmallFile } from "../small_file.js";
 import { Course, stageName } from "./course.js";
 import { LiveScene } from "./live_scene.js";
 import { estimateOf, notificationButton, secondsLeft, sentenceOf, showNotification } from "./left.js";
@@ -96,6 +97,9 @@ function heard(record) {
 
 function ended() {
   stream.close();
+  if (course.state === "succeeded" && !FINAL.includes(job.state)) {
+    void makeSmallFile(`/v1/models/${encodeURIComponent(job.model ?? id)}`); // before the model's page asks for it
+  }
   byId("notify").replaceChildren();
   if (notifies) showNotification(job.name || `Job ${id}`, `${badgeText(course.state, false)}.`);
   notifies = false;
