@@ -23,6 +23,8 @@ from splatmill.backplane.queue import entries, leases, queue, rq_keys, workers
 from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import Backend, Job, Role, TrainOptions
+from splatmill_worker.service.rq_worker import AttemptWorker
+from tests.support import standin
 from tests.support.jobs import CAPTURE, read_job, write_row
 from tests.support.queue_entries import waiting
 from tests.support.redis_server import RedisServer
@@ -298,3 +300,15 @@ def test_a_worker_whose_record_expired_while_redis_was_away_is_listed_again(
         connection.delete(*expired, "rq:workers", f"rq:workers:{entries.TRAIN}")
         (after,) = wait_for(lambda: workers.listening(connection))
         assert (after.name, after.lines) == (before.name, before.lines)
+
+
+def test_an_attempt_that_ends_while_it_is_killed_takes_nothing_else_with_it(
+    redis_server: RedisServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Group 0 is that of the caller: the worker and, where nothing gave it a group of its own, all around it."""
+    killed: list[int] = []
+    monkeypatch.setattr(os, "killpg", lambda group, _: killed.append(group))
+    pids = iter([54321, 0])
+    monkeypatch.setattr(AttemptWorker, "horse_pid", property(lambda _: next(pids)))
+    AttemptWorker(redis_server.connection, lambda: standin.run, ("any",)).kill_horse()
+    assert killed == [54321]

@@ -271,10 +271,14 @@ class AttemptWorker(Worker):
             self.kill_horse()
 
     def kill_horse(self, sig: signal.Signals = signal.SIGKILL) -> None:
-        """Kill the attempt and every process that it started."""
-        if self.horse_pid:
+        """Kill the attempt and every process that it started.
+
+        The thread that hears commands calls this too, while the attempt may end: its process is 0 then, which would
+        kill this process and its group. So it is read once.
+        """
+        if horse := self.horse_pid:
             with suppress(ProcessLookupError, PermissionError):
-                os.killpg(self.horse_pid, sig)
+                os.killpg(horse, sig)
 
     # A signal handler can interrupt any line, with any lock held. So the handlers write neither to the log nor to
     # Redis, and raise nothing: redis-py drops exceptions in what it does around each command, and hiredis crashes on
