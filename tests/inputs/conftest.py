@@ -22,8 +22,11 @@ from tests.support.made_once import made_once
 from tests.support.paths import DATA, ROOT
 
 INPUTS = DATA.parent / "inputs"
-PLAIN_WITHOUT_CAMERAS = 27.2
-"""Held-out PSNR in dB of the plain still life that all inputs are made from, whose cameras are recovered."""
+PLAIN_WITHOUT_CAMERAS = 27.05
+"""Held-out PSNR in dB of the plain still life that all inputs are made from, whose cameras are recovered.
+
+The mean of five runs, which went from 26.96 to 27.13.
+"""
 
 Build = Callable[..., Path]
 Train = Callable[..., "Trained"]
