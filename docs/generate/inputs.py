@@ -30,7 +30,8 @@ from splatmill_worker.readers import scan
 from splatmill_worker.readers.colmap_files import MODELS
 from splatmill_worker.readers.programs.shots import MAX_LENGTH_ERROR
 from splatmill_worker.scene import MIN_SHOWN
-from splatmill_worker.sfm.posed import colmap_model, model_files, points, polycam, same_bytes, triangulation
+from splatmill_worker.sfm.posed import colmap_model, model_files, polycam, same_bytes
+from splatmill_worker.sfm.posed.judged import points, triangulation
 from tests.support.inputs.example import answer
 from tests.support.inputs.table import EXAMPLES
 

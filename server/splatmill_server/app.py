@@ -24,18 +24,8 @@ from splatmill_server.base.settings import Settings
 from splatmill_server.middleware import RequestMiddleware
 from splatmill_server.routes import bin as bin_routes
 from splatmill_server.routes import (
-    camera_paths,
     captures,
-    edits,
-    estimate,
     imports,
-    job_live,
-    job_outputs,
-    jobs,
-    meshes,
-    models,
-    orbits,
-    presentation,
     session,
     shared,
     shares,
@@ -45,6 +35,8 @@ from splatmill_server.routes import (
     webhooks,
 )
 from splatmill_server.routes import keys as key_routes
+from splatmill_server.routes.jobs import estimate, jobs, live, outputs
+from splatmill_server.routes.models import camera_paths, edits, meshes, models, orbits, presentation
 from splatmill_server.service import Service
 from splatmill_server.web import pages
 
@@ -129,8 +121,8 @@ def _routes() -> Sequence[BaseRoute]:
         uploads,
         imports,
         jobs,
-        job_live,
-        job_outputs,
+        live,
+        outputs,
         estimate,
         edits,
         models,

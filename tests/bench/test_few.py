@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from splatmill.schema import TrainOptions
-from splatmill_worker.pipeline.holdout import split_views
+from splatmill_worker.pipeline.holdout.split import split_views
 from splatmill_worker.scene import PointViews, Scene, View
 from splatmill_worker.sfm import posed
 from splatmill_worker.synthetic import look_at

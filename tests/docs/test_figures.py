@@ -35,7 +35,7 @@ from splatmill_server.base.settings import Settings
 from splatmill_server.captures import records
 from splatmill_server.jobs import estimate, restoring
 from splatmill_server.jobs import records as jobs
-from splatmill_server.routes import job_live
+from splatmill_server.routes.jobs import live as job_live
 from splatmill_server.space import usage
 from splatmill_server.up import supervisor
 from splatmill_worker import memory as worker_memory

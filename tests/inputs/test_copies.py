@@ -13,7 +13,7 @@ from PIL import Image
 
 from splatmill_worker.images.copies import SmallPicture, copies, is_copy, small_grey
 from splatmill_worker.images.prepare import prepare
-from splatmill_worker.pipeline.near_copies import same_photos
+from splatmill_worker.pipeline.holdout.near_copies import same_photos
 from splatmill_worker.sfm import posed
 from tests.inputs.conftest import Build
 from tests.support.paths import DATA

@@ -11,7 +11,7 @@ from PIL import Image, ImageOps
 
 from splatmill_worker.images.load import load_view
 from splatmill_worker.sfm import posed
-from splatmill_worker.sfm.posed import orientation
+from splatmill_worker.sfm.posed.judged import orientation
 from tests.inputs.conftest import Build
 
 

@@ -13,7 +13,7 @@ from splatmill_server.access.caller import Caller
 from splatmill_server.base.problems import ProblemError
 from splatmill_server.base.root_path import address
 from splatmill_server.responses.model_outputs import model_file, model_in_format, rendered_by_query
-from splatmill_server.routes.models import CAMERA_QUERY, RENDER_PROBLEMS, RENDERED
+from splatmill_server.routes.models.models import CAMERA_QUERY, RENDER_PROBLEMS, RENDERED
 from splatmill_server.routes.openapi import answer, binary, problems
 from splatmill_server.service import Shared
 from splatmill_server.shares import StoredShare

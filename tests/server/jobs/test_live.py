@@ -9,7 +9,7 @@ import redis
 from splatmill.backplane import keys
 from splatmill.backplane.storage import layout
 from splatmill.schema import CamerasEvent, JobState, Placement, SnapshotEvent, StateEvent
-from splatmill_server.routes.job_live import WATCH_SECONDS
+from splatmill_server.routes.jobs.live import WATCH_SECONDS
 from tests.support.served_app import ServedApp, problem
 from tests.support.server_events import follow
 

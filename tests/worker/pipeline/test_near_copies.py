@@ -16,7 +16,7 @@ from PIL import Image
 
 from splatmill.schema import TrainOptions
 from splatmill_worker.images.overlays import overlays
-from splatmill_worker.pipeline.holdout import honest_split, split_views
+from splatmill_worker.pipeline.holdout.split import honest_split, split_views
 from splatmill_worker.scene import Camera, Scene, View, viewmat_of
 from splatmill_worker.synthetic import photograph
 from splatmill_worker.synthetic import still_life as built_in
@@ -209,7 +209,7 @@ def line(count: int, step: float) -> Scene:
 
 
 def test_of_a_slow_video_fewer_frames_are_held_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("splatmill_worker.pipeline.holdout.same_photos", lambda scene: {})
+    monkeypatch.setattr("splatmill_worker.pipeline.holdout.split.same_photos", lambda scene: {})
     parts = honest_split(line(128, 0.0006), OPTIONS)
     assert 1 < len(parts.held_out) < 16
     places = np.array([view.camera.center[0] for view in parts.training])
@@ -220,7 +220,7 @@ def test_of_a_slow_video_fewer_frames_are_held_out(monkeypatch: pytest.MonkeyPat
 
 
 def test_photos_from_one_place_are_kept_with_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("splatmill_worker.pipeline.holdout.same_photos", lambda scene: {})
+    monkeypatch.setattr("splatmill_worker.pipeline.holdout.split.same_photos", lambda scene: {})
     scene = line(16, 0.00001)
     parts = honest_split(scene, OPTIONS)
     assert (parts.training, parts.held_out) == split_views(scene, OPTIONS)

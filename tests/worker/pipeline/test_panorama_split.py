@@ -12,7 +12,7 @@ from PIL import Image
 from splatmill.schema import TrainOptions
 from splatmill_worker.images.lens import PANORAMA
 from splatmill_worker.images.panoramas import faces
-from splatmill_worker.pipeline.holdout import honest_split
+from splatmill_worker.pipeline.holdout.split import honest_split
 from splatmill_worker.scene import Camera, Lens, PointViews, Scene, View, viewmat_of
 from splatmill_worker.sfm import posed
 from splatmill_worker.sfm.posed.written import write_cameras

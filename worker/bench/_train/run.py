@@ -28,7 +28,7 @@ from splatmill_worker.__main__ import return_freed_memory
 from splatmill_worker.errors import ModelUnreadable, Refusal, TrainingFailed
 from splatmill_worker.images.load import load_views
 from splatmill_worker.pipeline.capture import posed_scene
-from splatmill_worker.pipeline.holdout import split_views
+from splatmill_worker.pipeline.holdout.split import split_views
 from splatmill_worker.pipeline.job import choose_kernels
 from splatmill_worker.scene import Normalization, Scene
 from splatmill_worker.sfm import posed

@@ -8,7 +8,7 @@ from splatmill.schema import LogEvent
 from splatmill_worker.images.panoramas import faces
 from splatmill_worker.pipeline.capture import posed_scene
 from splatmill_worker.pipeline.events import progress_events
-from splatmill_worker.pipeline.holdout import honest_split
+from splatmill_worker.pipeline.holdout.split import honest_split
 from splatmill_worker.pipeline.job import Job
 from splatmill_worker.pipeline.live import LiveCameras, placement_of, store_placement
 from splatmill_worker.pipeline.stage_times import Stages

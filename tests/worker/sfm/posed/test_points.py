@@ -21,8 +21,8 @@ from splatmill_worker.scene import Camera, Float, Lens, Scene, Source, View, vie
 from splatmill_worker.sfm import posed, stereo
 from splatmill_worker.sfm.matching.overlap import by_overlap
 from splatmill_worker.sfm.options import LEAN
-from splatmill_worker.sfm.posed.conventions import FLIP
-from splatmill_worker.sfm.posed.triangulation import Triangulated, triangulate
+from splatmill_worker.sfm.posed.judged.conventions import FLIP
+from splatmill_worker.sfm.posed.judged.triangulation import Triangulated, triangulate
 from splatmill_worker.splat.plan.decide import decide
 from tests.support.facts import FACTS
 

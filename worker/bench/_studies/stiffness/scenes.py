@@ -16,7 +16,7 @@ from _train.configurations import revised
 from splatmill.schema import TrainOptions
 from splatmill_worker.images.load import Photo, load_views
 from splatmill_worker.pipeline.capture import posed_scene
-from splatmill_worker.pipeline.holdout import split_views
+from splatmill_worker.pipeline.holdout.split import split_views
 from splatmill_worker.scene import Normalization, Scene, View
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.plan.decide import decide

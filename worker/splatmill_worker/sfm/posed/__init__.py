@@ -2,7 +2,7 @@
 
 from splatmill_worker.sfm.posed.camera_models import UnreadModel
 from splatmill_worker.sfm.posed.capture import PosedInput, find, without_cameras
-from splatmill_worker.sfm.posed.points import with_loose_points, with_points
+from splatmill_worker.sfm.posed.judged.points import with_loose_points, with_points
 from splatmill_worker.sfm.posed.programs import TwoFiles
 
 __all__ = [

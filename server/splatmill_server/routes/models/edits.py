@@ -18,7 +18,7 @@ from splatmill_server.edits import store_edited
 from splatmill_server.requests.ownership import ModelId
 from splatmill_server.requests.parameters import JSON_ONLY
 from splatmill_server.responses.forward import CLIENT_GONE, client_of, while_connected
-from splatmill_server.routes.models import RENDER_PROBLEMS
+from splatmill_server.routes.models.models import RENDER_PROBLEMS
 from splatmill_server.routes.openapi import answer, problems
 from splatmill_server.service import Service, Shared
 from splatmill_server.space.quota import Arrival

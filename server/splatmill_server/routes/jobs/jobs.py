@@ -16,7 +16,7 @@ from splatmill_server.base.problems import ProblemError
 from splatmill_server.jobs.listing import By
 from splatmill_server.requests.ownership import JobId, ListedOwner
 from splatmill_server.requests.parameters import JSON_ONLY, Cursor, Favourite, Limit, NamePart, Sort, TagOf
-from splatmill_server.routes.job_form import create_from_form
+from splatmill_server.routes.jobs.form import create_from_form
 from splatmill_server.routes.openapi import JOB_REQUESTS, answer, problems
 from splatmill_server.service import Service, Shared
 

@@ -9,7 +9,7 @@ from splatmill.schema import MIN_PHOTOS, TrainOptions
 from splatmill.schema.quantities import counted, listed
 from splatmill_worker.errors import Refusal
 from splatmill_worker.images.copies import warning as copies_warning
-from splatmill_worker.pipeline.near_copies import near_copies, same_photos
+from splatmill_worker.pipeline.holdout.near_copies import near_copies, same_photos
 from splatmill_worker.scene import Scene, View, split
 
 MOST_NEAR = 0.5

@@ -23,7 +23,7 @@ from splatmill_worker.sfm.callbacks import OnProgress
 from splatmill_worker.sfm.matching import overlap, two_view
 from splatmill_worker.sfm.matching.pairs import Pair
 from splatmill_worker.sfm.options import LEAN, fitted
-from splatmill_worker.sfm.posed.searched import database_of, epipolar_errors, features_of, model_of
+from splatmill_worker.sfm.posed.judged.searched import database_of, epipolar_errors, features_of, model_of
 from splatmill_worker.sfm.run import torch_threads
 
 SAMPLE = 16

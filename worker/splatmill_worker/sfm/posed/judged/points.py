@@ -23,9 +23,9 @@ from splatmill_worker.sfm import stereo
 from splatmill_worker.sfm.callbacks import OnProgress
 from splatmill_worker.sfm.matching import two_view
 from splatmill_worker.sfm.options import LEAN, STANDARD
-from splatmill_worker.sfm.posed import conventions, orientation
-from splatmill_worker.sfm.posed.evidence import Evidence, evidence_of
-from splatmill_worker.sfm.posed.triangulation import Triangulated, contradicted, triangulate
+from splatmill_worker.sfm.posed.judged import conventions, orientation
+from splatmill_worker.sfm.posed.judged.evidence import Evidence, evidence_of
+from splatmill_worker.sfm.posed.judged.triangulation import Triangulated, contradicted, triangulate
 
 VERSION = 2
 """Version of the method; points stored under another version are searched for anew."""

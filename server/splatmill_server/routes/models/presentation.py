@@ -9,7 +9,7 @@ from splatmill_server.access.caller import Who
 from splatmill_server.requests.ownership import ModelId
 from splatmill_server.requests.parameters import JSON_ONLY
 from splatmill_server.responses.forward import client_of
-from splatmill_server.routes.models import RENDER_PROBLEMS
+from splatmill_server.routes.models.models import RENDER_PROBLEMS
 from splatmill_server.routes.openapi import problems
 from splatmill_server.service import Shared
 

@@ -20,8 +20,8 @@ from splatmill_worker.sfm.callbacks import OnProgress, watched
 from splatmill_worker.sfm.features import Features
 from splatmill_worker.sfm.matching import overlap, pairs, two_view
 from splatmill_worker.sfm.options import Effort, fitted
-from splatmill_worker.sfm.posed.conventions import better
-from splatmill_worker.sfm.posed.searched import database_of, epipolar_errors, features_of, model_of
+from splatmill_worker.sfm.posed.judged.conventions import better
+from splatmill_worker.sfm.posed.judged.searched import database_of, epipolar_errors, features_of, model_of
 from splatmill_worker.sfm.run import torch_threads
 
 Float = npt.NDArray[np.float64]

@@ -1,0 +1,1 @@
+"""The endpoints of models and of what is made of them."""

@@ -1,0 +1,1 @@
+"""Given cameras and points judged by the photos: which of them their matches and colours confirm."""
