@@ -297,9 +297,13 @@ def test_a_failed_job_says_why_and_what_to_do(service: Up, visit: Visit) -> None
     expect(alert).to_contain_text(problem["detail"])
     expect(alert).to_contain_text(problem["advice"])
 
+    service.http.put(f"/v1/bin/captures/{capture}").raise_for_status()
     page.get_by_role("link", name="Train with other options").click()
     page.wait_for_url(f"**/?capture={capture}&options_of={job_id}")
     page.locator("html[data-ready]").wait_for()
+    expect(page.locator("#place")).to_contain_text(
+        "These photos are in the bin. A job on them takes them out"
+    )
     page.get_by_role("button", name="Train", exact=True).click()
     page.wait_for_url("**/jobs/*")
     repeated = service.job(page.url.rpartition("/")[2])

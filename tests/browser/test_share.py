@@ -56,6 +56,9 @@ def test_links_are_made_and_revoked_on_the_page(service: Up, model: SmallModel, 
     expect(entry).to_contain_text("valid until")
     entry.get_by_role("button", name="Revoke").click()
     expect(entry).to_contain_text("revoked")
+    expect(dialog.get_by_label("The link")).to_be_visible()  # that is another one
+    dialog.get_by_role("listitem").filter(has_text="with photos").get_by_role("button").click()
+    expect(dialog.get_by_label("The link")).to_have_count(0)
     assert httpx.get(f"{link}/model").status_code == 410
     page.keyboard.press("Escape")
     expect(dialog).to_be_hidden()

@@ -20,6 +20,7 @@ export async function openSharing(address, name) {
   const label = h("input", { id: "share-name", maxlength: 200, autocomplete: "off" });
   const made = h("div", { class: "stack", role: "status" });
   const list = h("ul", { class: "links" });
+  let latest = ""; // id of the link in `made`
   const trouble = h("div");
   const form = h("form", { class: "stack" },
     h("div", { class: "row" },
@@ -57,6 +58,7 @@ export async function openSharing(address, name) {
   /** @param {any} share */
   const revoke = (share) => tried(async () => {
     await send("DELETE", `${address}/shares/${share.id}`);
+    if (share.id === latest) made.replaceChildren();
     await show();
     /** @type {HTMLElement} */ (form.querySelector("button")).focus();
   });
@@ -66,6 +68,7 @@ export async function openSharing(address, name) {
     void tried(async () => {
       const share = await send("POST", `${address}/shares`, { expires_in: term.value, name: label.value.trim() || null, photos: photos.checked });
       void makeSmallFile(address); // before visitors come
+      latest = share.id;
       made.replaceChildren(link(`${location.origin}${at(share.path)}`, name));
       made.scrollIntoView({ block: "nearest" });
       label.value = "";

@@ -279,21 +279,25 @@ async function showPhone() {
  */
 async function useCapture(id, earlier) {
   try {
-    const capture = await get(`/v1/captures/${encodeURIComponent(id)}`);
+    const [capture, { entries }] = await Promise.all([get(`/v1/captures/${encodeURIComponent(id)}`), get("/v1/bin")]);
     start.use(capture);
     if (earlier) form.fill((await get(`/v1/jobs/${encodeURIComponent(earlier)}`)).options);
-    showCapture(capture);
+    showCapture(capture, entries.some((/** @type {any} */ entry) => entry.kind === "capture" && entry.id === capture.id));
   } catch (error) {
     notify(/** @type {Error} */ (error));
     await listCaptures();
   }
 }
 
-/** Say what the server holds of a capture that a job is to be started on. @param {any} capture */
-function showCapture(capture) {
+/**
+ * Say what the server holds of a capture that a job is to be started on.
+ * @param {any} capture @param {boolean} [deleted] whether it is in the bin
+ */
+function showCapture(capture, deleted = false) {
   const size = capture.files.reduce((/** @type {number} */ sum, /** @type {any} */ file) => sum + file.size, 0);
   byId("place").replaceChildren(h("div", { class: "notice" },
     h("p", {}, `${capture.name || "Photos without a name"}: ${count(capture.files.length, "file")}, ${bytes(size)}, already on the server.`),
+    deleted && h("p", {}, h("strong", {}, "These photos are in the bin. "), "A job on them takes them out of it, and they are kept from then on."),
     h("p", {}, "Choose the settings of another job, or give more photos first. ", h("a", { href: "/" }, "Begin with new photos"))));
   byId("drop-title").textContent = "Drop more photos here";
   redraw();
