@@ -78,12 +78,13 @@ class Finished:
 
 
 def figures(job: Mapping[str, Any], report: Mapping[str, Any]) -> Figures | None:
-    """Return the figures of a job from its `job.json` and `report.json`, or None for a job of several attempts.
+    """Return the figures of a job from its `job.json` and `report.json`, or None for one whose times are not its own: a
+    job of several attempts, and an edited model, which has the report of the job that trained it.
 
     Raises KeyError, TypeError, ValueError and AttributeError for records without the fields.
     """
-    if job.get("attempt") != 1:
-        return None  # its wall time includes what was lost, and waiting
+    if job.get("attempt") != 1 or "edit" in report:
+        return None  # the wall time includes what was lost, and waiting, or all until the edit
     seconds, facts, plan = report["seconds"], report["facts"], report["plan"]
     options = job.get("options", {})
     wall = (_time(job["finished_at"]) - _time(job["started_at"])).total_seconds()

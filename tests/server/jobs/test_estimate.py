@@ -232,6 +232,9 @@ def test_figures_are_read_from_the_records_of_a_real_job() -> None:
     assert wall == pytest.approx(17.4024, abs=1e-3)
     assert 0.0 < found.pixel_share < 1.0
     assert figures({**stored, "attempt": 2}, report) is None
+    assert figures(stored, {**report, "edit": {"model": "before"}}) is None, (
+        "an edit has the report of its training"
+    )
 
 
 def test_cameras_that_an_earlier_job_recovered_count_with_the_time_that_took() -> None:
