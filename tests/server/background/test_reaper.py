@@ -76,7 +76,10 @@ def quick_leases(app: ServedApp, monkeypatch: pytest.MonkeyPatch) -> None:
 @contextmanager
 def worker(app: ServedApp, pid_file: Path, what: str = "sleep") -> Iterator[subprocess.Popen[bytes]]:
     command = [sys.executable, "-c", WORKER, app.settings.redis_url, str(pid_file), what]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    # RQ's own worker, asked to end an attempt that has just ended, kills its own group: it has one to itself.
+    process = subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+    )
     try:
         yield process
     finally:
