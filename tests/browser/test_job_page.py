@@ -457,7 +457,7 @@ def test_the_course_of_a_job_follows_from_its_events(page: Page) -> None:
     assert restarted["steps"] == [10, 20, 30]
 
 
-SECONDS_LEFT = """async ([at, spent, eta, estimate]) => {
+SECONDS_LEFT = """async ([at, spent, eta, stage, estimate]) => {
     const { Course } = await import("/page/any/job/course.js");
     const { secondsLeft } = await import("/page/any/job/left.js");
     const course = new Course(), time = (seconds) => new Date(1e12 + 1000 * seconds).toISOString();
@@ -466,33 +466,60 @@ SECONDS_LEFT = """async ([at, spent, eta, estimate]) => {
         course.apply({ event: { type: "state", state }, at: time(now), attempt: 1 });
         now += seconds;
     }
-    const event = { type: "progress", stage: "training", done: 5, total: 10, eta };
-    if (eta !== null) course.apply({ event, at: time(now), attempt: 1 });
+    const event = { type: "progress", stage, done: 5, total: 10, eta };
+    if (stage) course.apply({ event, at: time(now), attempt: 1 });
     return secondsLeft(course, new Map(Object.entries(estimate)), 1e12 + 1000 * (now + at));
 }"""
 
 
+def test_a_number_of_steps_that_is_a_bound_is_called_one(page: Page) -> None:
+    said = """async (note) => {
+        const { Course } = await import("/page/any/job/course.js");
+        const { showTimeline } = await import("/page/any/job/timeline.js");
+        const course = new Course(), list = document.createElement("ol"), at = new Date(1e12).toISOString();
+        const progress = { type: "progress", stage: "training", done: 1200, total: 4000, eta: 20, note };
+        for (const event of [{ type: "state", state: "training" }, progress]) course.apply({ event, at, attempt: 1 });
+        showTimeline(list, course, 1e12);
+        return list.querySelector(".stage-now p").textContent;
+    }"""
+    page.goto("/glossary")
+    whole = page.evaluate(said, None)
+    assert (whole.count("about"), whole.count("at most")) == (2, 0)
+    bound = page.evaluate(said, "or fewer, where more gain too little")
+    assert (bound.count("about"), bound.count("at most")) == (0, 2)
+
+
 @pytest.mark.parametrize(
-    ("at", "spent", "eta", "left"),
+    ("at", "spent", "eta", "stage", "left"),
     [
-        (0, [["queued", 5]], None, 130),
-        (0, [["queued", 5], ["preparing", 4]], None, 126),
-        (0, [["queued", 5], ["preparing", 4], ["sfm", 10]], None, 116),
+        (0, [["queued", 5]], None, None, 130),
+        (0, [["queued", 5], ["preparing", 4]], None, None, 126),
+        (0, [["queued", 5], ["preparing", 4], ["sfm", 10]], None, None, 116),
         (
             0,
             [["queued", 5], ["preparing", 4], ["sfm", 50]],
             None,
+            None,
             106,
         ),  # longer than others: over at any moment
-        (0, [["queued", 5], ["preparing", 4], ["sfm", 50], ["training", 10]], 70, 76),
-        (5, [["queued", 5], ["preparing", 4], ["sfm", 50], ["training", 10]], 70, 71),
-        (0, [["queued", 5], ["preparing", 4], ["sfm", 50], ["training", 10], ["exporting", 2]], None, 4),
+        (0, [["queued", 5], ["preparing", 4], ["sfm", 50], ["training", 10]], 70, "training", 76),
+        (5, [["queued", 5], ["preparing", 4], ["sfm", 50], ["training", 10]], 70, "training", 71),
+        # The scene is finished, and compared with its photos: nothing of the training is left.
+        (2, [["queued", 5], ["preparing", 4], ["sfm", 50], ["training", 10]], 7, "evaluation", 11),
+        (2, [["queued", 5], ["preparing", 4], ["sfm", 50], ["training", 10]], None, "evaluation", 6),
+        (
+            0,
+            [["queued", 5], ["preparing", 4], ["sfm", 50], ["training", 10], ["exporting", 2]],
+            None,
+            None,
+            4,
+        ),
     ],
 )
 def test_the_time_left_counts_all_that_is_to_come(
-    visit: Visit, at: float, spent: Any, eta: float | None, left: float
+    visit: Visit, at: float, spent: Any, eta: float | None, stage: str | None, left: float
 ) -> None:
     estimate = {"cameras": 20, "training": 100, "rest": 10}
     visit.page.goto("/glossary")
-    assert visit.page.evaluate(SECONDS_LEFT, [at, spent, eta, estimate]) == left
-    assert visit.page.evaluate(SECONDS_LEFT, [at, spent, eta, estimate | {"rest": None}]) is None
+    assert visit.page.evaluate(SECONDS_LEFT, [at, spent, eta, stage, estimate]) == left
+    assert visit.page.evaluate(SECONDS_LEFT, [at, spent, eta, stage, estimate | {"rest": None}]) is None

@@ -56,6 +56,11 @@ def test_a_posed_capture_becomes_a_model_with_its_reports(whole: Run) -> None:
     assert kinds.count("plan") == 1
     assert kinds.count("metric") >= 5
     assert "preview" in kinds
+    # The finished scene is compared with the held-out photos and some others: one by one, while nothing trains.
+    progress = [event for event in events if event.type == "progress"]
+    compared = [event for event in progress if event.stage == "evaluation"]
+    assert progress[-len(compared) :] == compared
+    assert [(event.done, event.total) for event in compared] == [(done, 14) for done in range(1, 15)]
 
     out = outcome.out
     assert {path.name for path in out.iterdir()} == {

@@ -18,6 +18,9 @@ from splatmill_worker.splat.views import TrainingView
 
 Emit = Callable[[Event], None]
 
+AT_MOST = "or fewer, where more gain too little"
+"""Note of a training whose number of steps is a bound."""
+
 
 def progress_events(emit: Emit) -> Callable[[str, int, int, str], None]:
     """A callback (stage, done, total, note) that emits each call as a progress event, with its seconds left."""
@@ -45,6 +48,7 @@ class TrainingEvents:
 
     def __init__(self, emit: Emit, workdir: Path, plan: Plan, view: TrainingView) -> None:
         self._emit, self._workdir, self._plan, self._view = emit, workdir, plan, view
+        self._emit_progress = progress_events(emit)
         self._last: CurvePoint | None = None
         self.warnings: list[str] = []
 
@@ -62,8 +66,13 @@ class TrainingEvents:
                 gaussians=progress.gaussians,
                 seconds=progress.seconds,
                 eta=progress.eta,
+                note=AT_MOST if progress.at_most else None,
             )
         )
+
+    def evaluating(self, done: int, total: int) -> None:
+        """Emit how many photos the finished scene was compared with."""
+        self._emit_progress("evaluation", done, total, "photos compared with the scene")
 
     def evaluated(self, point: CurvePoint, engine: Engine) -> None:
         """Emit the metrics of an evaluation, and render the preview anew."""

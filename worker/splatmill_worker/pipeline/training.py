@@ -53,6 +53,7 @@ def train_scene(
         hooks=Hooks(
             progress=record.events.progress,
             evaluated=record.events.evaluated,
+            evaluating=record.events.evaluating,
             warn=record.events.warn,
             cancelled=job.cancelled,
             checkpoint=lambda snapshot: checkpoint.save(job.checkpoints, snapshot),

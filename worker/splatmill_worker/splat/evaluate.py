@@ -86,11 +86,16 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 
 def evaluate(
-    render: Renderer, views: Sequence[TrainingView], background: Tensor, distances: Distances | None = None
+    render: Renderer,
+    views: Sequence[TrainingView],
+    background: Tensor,
+    distances: Distances | None = None,
+    scored: Callable[[], None] = lambda: None,
 ) -> Score:
     """Score of every view at full training resolution, over the RGB `background` [3] where photos are transparent.
 
     distances: LPIPS is computed with them, but not of photos with a mask or with a side below LEAST_SIDE.
+    scored: called after each view.
     """
     scores = []
     for view in views:
@@ -102,6 +107,7 @@ def evaluate(
             vgg, alex = (distance(*pictures) for distance in distances)
             score = replace(score, lpips_vgg=vgg, lpips_alex=alex)
         scores.append(score)
+        scored()
     return Score(tuple(scores))
 
 

@@ -44,9 +44,11 @@ def test_a_budget_is_doubled_while_that_gains_up_to_the_longest() -> None:
     assert trained.stopped.startswith("the budget is spent; the last doubling gained ")
 
 
-@pytest.mark.parametrize(("least", "said", "end"), [(0.0, [400], 400), (50.0, [400, 60], 60)])
+@pytest.mark.parametrize(
+    ("least", "said", "end", "bounds"), [(0.0, [400], 400, 120), (50.0, [400, 60], 60, 40)]
+)
 def test_what_is_done_and_what_is_left_never_go_back(
-    least: float, said: list[int], end: int, monkeypatch: pytest.MonkeyPatch
+    least: float, said: list[int], end: int, bounds: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The number of steps is that of the longest run at first, and what it becomes once that is decided."""
     monkeypatch.setattr(observers, "PROGRESS_SECONDS", 0.0)
@@ -55,6 +57,8 @@ def test_what_is_done_and_what_is_left_never_go_back(
     train(first_engine(), views, held_out, course(least), extent=1.1, hooks=Hooks(progress=reports.append))
     assert (len(reports), reports[-1].step, reports[-1].steps) == (end, end, end)
     assert list(dict.fromkeys(report.steps for report in reports)) == said
+    # They are said to be a bound for as long as the run may end earlier.
+    assert [report.at_most for report in reports] == [True] * bounds + [False] * (end - bounds)
     for before, after in pairwise(reports):
         assert after.step / after.steps >= before.step / before.steps
         assert after.steps - after.step <= before.steps - before.step

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import count
 
 from splatmill_worker.splat.engine.protocol import Engine
 from splatmill_worker.splat.evaluate import Score, evaluate
@@ -38,9 +39,14 @@ class Evaluations:
         run: TrainingRun,
         held_out: Sequence[TrainingView],
         evaluated: Callable[[CurvePoint, Engine], None] = lambda _point, _engine: None,
+        evaluating: Callable[[int, int], None] = lambda _done, _total: None,
     ) -> None:
-        """evaluated: called with every new point of the curve."""
-        self._run, self._held_out, self._evaluated = run, held_out, evaluated
+        """evaluated: called with every new point of the curve.
+
+        evaluating: called with each view of the final scores: how many so far, and of how many.
+        """
+        self._run, self._held_out = run, held_out
+        self._evaluated, self._evaluating = evaluated, evaluating
         aside = len(run.set_aside)
         self._chosen = curve_views(
             len(held_out), len(run.views) - aside, run.plan.schedule.expected_steps, aside
@@ -129,7 +135,14 @@ class Evaluations:
 
     def _all(self) -> FinalScores:
         distances = self._distances() if self._run.plan.lpips and self._held_out else None
-        return self._of(self._held_out, finally_evaluated(trained_on(self._run)), distances)
+        training = finally_evaluated(trained_on(self._run))
+        done = count(1)
+        return self._of(
+            self._held_out,
+            training,
+            distances,
+            lambda: self._evaluating(next(done), len(self._held_out) + len(training)),
+        )
 
     def _distances(self) -> Distances | None:
         """LPIPS's networks; None, with a warning, where their files went since training began."""
@@ -151,12 +164,13 @@ class Evaluations:
         held_out: Sequence[TrainingView],
         training: Sequence[TrainingView],
         distances: Distances | None = None,
+        scored: Callable[[], None] = lambda: None,
     ) -> FinalScores:
         run = self._run
         render, background = renderer(run.engine, run.plan), evaluation_background(run.plan, run.views)
         return FinalScores(
-            evaluate(render, held_out, background, distances) if held_out else None,
-            evaluate(render, training, background),
+            evaluate(render, held_out, background, distances, scored) if held_out else None,
+            evaluate(render, training, background, scored=scored),
         )
 
 

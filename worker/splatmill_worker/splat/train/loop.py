@@ -37,6 +37,7 @@ class Hooks:
 
     progress: now and then (`ProgressReports`).
     evaluated: with every new point of the curve.
+    evaluating: with each view that is evaluated after the last step: how many so far, and of how many.
     warn: with a sentence, when a numerical failure was rolled back.
     cancelled: before every step; training ends when it returns True.
     checkpoint: with a snapshot to store, now and then (`Checkpoints`) and on a cancellation; None: never.
@@ -46,6 +47,7 @@ class Hooks:
 
     progress: Callable[[TrainingProgress], None] = lambda _: None
     evaluated: Callable[[CurvePoint, Engine], None] = lambda _point, _engine: None
+    evaluating: Callable[[int, int], None] = lambda _done, _total: None
     warn: Callable[[str], None] = lambda _: None
     cancelled: Callable[[], bool] = lambda: False
     checkpoint: Callable[[Snapshot], None] | None = None
@@ -118,8 +120,8 @@ def train(
     if resume_from is not None:
         run.resume(resume_from)
     validation = tuple(run.views[index].name for index in sorted(run.set_aside))
-    evaluations, look = Evaluations(run, held_out, hooks.evaluated), Look(run)
-    observers: list[Observer] = [evaluations, look, *hooks.observers, ProgressReports(hooks.progress)]
+    evaluations, look = Evaluations(run, held_out, hooks.evaluated, hooks.evaluating), Look(run)
+    observers: list[Observer] = [ProgressReports(hooks.progress), evaluations, look, *hooks.observers]
     if hooks.checkpoint is not None:
         observers.append(Checkpoints(hooks.checkpoint, hooks.checkpoint_seconds))
     failure = None

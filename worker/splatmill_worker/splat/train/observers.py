@@ -42,6 +42,7 @@ class TrainingProgress:
     gaussians: how many the scene has.
     seconds: training time so far.
     eta: training seconds to come, estimated.
+    at_most: whether the run ends earlier where more steps would gain too little, so that `steps` and `eta` are bounds.
     """
 
     step: int
@@ -50,6 +51,7 @@ class TrainingProgress:
     gaussians: int
     seconds: float
     eta: float
+    at_most: bool = False
 
 
 class ProgressReports:
@@ -66,10 +68,12 @@ class ProgressReports:
         """Report."""
         self._last = time.monotonic()
         step, seconds = run.state.step, run.clock.seconds
-        progress = run.longest.progress(step, seconds)
+        longest = run.longest
+        progress = longest.progress(step, seconds)
         steps = max(step, step if progress <= 0 else round(step / progress))
         eta = seconds * (1.0 - progress) / max(progress, 1e-6)
-        self._report(TrainingProgress(step, steps, run.loss, run.engine.count, seconds, eta))
+        at_most = longest != run.state.budget
+        self._report(TrainingProgress(step, steps, run.loss, run.engine.count, seconds, eta, at_most))
 
 
 class Checkpoints:

@@ -12,6 +12,7 @@ const STAGES = new Map(Object.entries({
   mapping: "Placing cameras",
   stereo: "Adding points by stereo",
   training: "Training",
+  evaluation: "Comparing photos with the scene",
 }));
 
 /** The name of a stage for people. @param {string} stage */

@@ -39,8 +39,9 @@ export function secondsLeft(course, estimate, now) {
   for (const [part, passing] of Object.entries(PASSES_IN)) {
     if (passing.every((state) => states.indexOf(state) < states.indexOf(course.state))) continue; // it is over
     const running = course.stages.get(course.progress?.stage);
-    if (part === "training" && course.state === "training" && running?.name === "training" && running.eta !== null) {
-      sum += Math.max(0, running.eta - (now - running.last) / 1000);
+    const training = part === "training" && course.state === "training" ? running?.name : "";
+    if (training === "evaluation" || (training === "training" && running?.eta != null)) {
+      sum += Math.max(0, (running?.eta ?? 0) - (now - (running?.last ?? now)) / 1000);
       continue;
     }
     const whole = estimate.get(part) ?? null;
