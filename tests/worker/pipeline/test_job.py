@@ -60,7 +60,7 @@ def test_a_posed_capture_becomes_a_model_with_its_reports(whole: Run) -> None:
     progress = [event for event in events if event.type == "progress"]
     compared = [event for event in progress if event.stage == "evaluation"]
     assert progress[-len(compared) :] == compared
-    assert [(event.done, event.total) for event in compared] == [(done, 14) for done in range(1, 15)]
+    assert [(event.done, event.total) for event in compared] == [(1, 2), (2, 2)]
 
     out = outcome.out
     assert {path.name for path in out.iterdir()} == {

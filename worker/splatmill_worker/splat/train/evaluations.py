@@ -43,7 +43,7 @@ class Evaluations:
     ) -> None:
         """evaluated: called with every new point of the curve.
 
-        evaluating: called with each view of the final scores: how many so far, and of how many.
+        evaluating: called with each held-out view of the final scores, which take the time: how many, and of how many.
         """
         self._run, self._held_out = run, held_out
         self._evaluated, self._evaluating = evaluated, evaluating
@@ -138,10 +138,7 @@ class Evaluations:
         training = finally_evaluated(trained_on(self._run))
         done = count(1)
         return self._of(
-            self._held_out,
-            training,
-            distances,
-            lambda: self._evaluating(next(done), len(self._held_out) + len(training)),
+            self._held_out, training, distances, lambda: self._evaluating(next(done), len(self._held_out))
         )
 
     def _distances(self) -> Distances | None:
@@ -170,7 +167,7 @@ class Evaluations:
         render, background = renderer(run.engine, run.plan), evaluation_background(run.plan, run.views)
         return FinalScores(
             evaluate(render, held_out, background, distances, scored) if held_out else None,
-            evaluate(render, training, background, scored=scored),
+            evaluate(render, training, background),
         )
 
 

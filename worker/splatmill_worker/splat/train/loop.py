@@ -37,7 +37,7 @@ class Hooks:
 
     progress: now and then (`ProgressReports`).
     evaluated: with every new point of the curve.
-    evaluating: with each view that is evaluated after the last step: how many so far, and of how many.
+    evaluating: with each held-out view that is evaluated after the last step: how many so far, and of how many.
     warn: with a sentence, when a numerical failure was rolled back.
     cancelled: before every step; training ends when it returns True.
     checkpoint: with a snapshot to store, now and then (`Checkpoints`) and on a cancellation; None: never.
