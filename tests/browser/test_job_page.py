@@ -290,7 +290,7 @@ def test_a_failed_job_says_why_and_what_to_do(service: Up, visit: Visit) -> None
     page.goto(f"/jobs/{job_id}")
     expect(page.locator("#state")).to_have_text("Failed")
     expect(page.get_by_role("heading", name="Log", exact=True)).to_be_visible()
-    for name in ("Live view", "Error against time"):
+    for name in ("Live view", "Quality against time"):
         expect(page.get_by_role("heading", name=name)).to_be_hidden()
     problem = service.job(job_id)["problem"]
     alert = page.get_by_role("alert")

@@ -29,7 +29,7 @@ const FILES = {
   "frame.json": "How the coordinates were chosen: up, unit, and where on the earth",
   "report.json": "The report as data",
   "report.html": "The report as a page",
-  "report.png": "Error against run time",
+  "report.png": "Quality against time",
   "progress.mp4": "Video of the training",
   "preview.jpg": "A picture of the model",
   "poster.jpg": "The picture from the start view, which links show",

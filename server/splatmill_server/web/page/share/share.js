@@ -10,7 +10,7 @@ import { startShell } from "../shell.js";
 
 const KINDS = /** @type {Record<string, string>} */ ({
   "report.html": "Report",
-  "report.png": "Error against time", "cameras.json": "Cameras of the photos", "preview.jpg": "Picture", "poster.jpg": "Picture from the start view", "progress.mp4": "Film of the training",
+  "report.png": "Quality against time", "cameras.json": "Cameras of the photos", "preview.jpg": "Picture", "poster.jpg": "Picture from the start view", "progress.mp4": "Film of the training",
 });
 
 await startShell({ open: true, visitor: true });
