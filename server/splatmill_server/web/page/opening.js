@@ -2,7 +2,7 @@
 
 import { get } from "./api.js";
 import { POSTER, PREVIEW, pictureOf } from "./picture.js";
-import { SMALL_FORMAT, makeSmallFile, smallFile } from "./small_file.js";
+import { SMALL_FORMAT, makeSmallFile, smallFile } from "./viewer/small_file.js";
 import { open } from "./viewer.js";
 
 /** Bytes of a model.ply that is loaded as it is: a smaller file of it would hardly be seen sooner. */

@@ -5,7 +5,7 @@ import { get, send } from "./api.js";
 import { h } from "./dom.js";
 import { moment } from "./format.js";
 import { noticeOf } from "./shell.js";
-import { makeSmallFile } from "./small_file.js";
+import { makeSmallFile } from "./viewer/small_file.js";
 
 const TERMS = [["1d", "1 day"], ["7d", "7 days"], ["30d", "30 days"], ["365d", "1 year"]];
 

@@ -9,7 +9,7 @@ import { CANCELLING, FINAL, badgeKind, badgeText } from "../job_states.js";
 import { labelButton, starButton, tagLinks } from "../labels.js";
 import { titleOf } from "../new/titles.js";
 import { confirmAction, noticeOf, notify, startShell } from "../shell.js";
-import { makeSmallFile } from "../small_file.js";
+import { makeSmallFile } from "../viewer/small_file.js";
 import { Course, stageName } from "./course.js";
 import { LiveScene } from "./live_scene.js";
 import { estimateOf, notificationButton, secondsLeft, sentenceOf, showNotification } from "./left.js";

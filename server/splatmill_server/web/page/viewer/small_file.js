@@ -1,6 +1,6 @@
 // The file of a model that the viewer loads, made by the server when it is first asked for.
 
-import { request } from "./api.js";
+import { request } from "../api.js";
 
 /** The format with the fewest bytes among those that the viewer draws; it costs about 0.03 dB. */
 export const SMALL_FORMAT = "sog";
