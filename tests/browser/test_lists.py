@@ -97,6 +97,21 @@ def test_jobs_are_filtered_paged_and_deleted(service: Up, model: SmallModel, pag
     expect(section).to_be_hidden()
 
 
+def test_what_a_cancelled_job_left_of_a_model_leads_to_the_job(
+    service: Up, model: SmallModel, page: Page
+) -> None:
+    (job,) = cancelled_jobs(service, model.capture, 1)
+    left = service.data / "storage/models" / job / "preview.jpg"
+    left.parent.mkdir(parents=True)
+    left.write_bytes(b"x" * (96 << 20))  # among the largest
+    wait_for(lambda: any(record["id"] == job for record in service.http.get("/v1/storage").json()["largest"]))
+    page.goto("/models")
+    rows = page.get_by_role("region", name="Storage").get_by_role("row")
+    unfinished = rows.filter(has_text="Unfinished model")
+    expect(unfinished.get_by_role("link", name="series 00")).to_have_attribute("href", f"/jobs/{job}")
+    expect(rows.locator(f"a[href='/models/{model.id}']")).to_be_visible()
+
+
 def test_photos_are_deleted_and_restored(service: Up, model: SmallModel, page: Page) -> None:
     capture = service.http.post("/v1/captures", json={"name": "not needed"}).json()["id"]
     photo = b"x" * (64 << 20)  # among the largest

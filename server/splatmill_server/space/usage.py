@@ -133,6 +133,7 @@ def largest(
             name=_name(snapshot, held),
             bytes=held.size,
             files=held.files,
+            complete=held.whole or held.kind is not StoredKind.model,
             last_used=moment(snapshot.last_used[held.key]),
             needed_by=snapshot.needed.get(held.key),
             expires_at=moment(expires[held.key]) if held.key in expires else None,

@@ -103,6 +103,22 @@ def test_an_unfinished_job_is_named_by_what_it_needs(people: ServedApp) -> None:
     }
 
 
+def test_what_a_cancelled_job_left_of_a_model_is_told_from_a_model(people: ServedApp) -> None:
+    ann = Person(people.http, "ann")
+    jobs = []
+    for _ in range(2):
+        jobs.append(ann("POST", "/v1/jobs", json={"capture": ann.capture(5, 5)}).json()["id"])
+        people.begin(jobs[-1])
+    _model(people, jobs[0], "ann")
+    people.service.storage.put(f"{layout.model(jobs[1])}/preview.jpg", b"half")
+    complete = {
+        (found["kind"], found["id"]): found["complete"]
+        for found in ann("GET", "/v1/storage").json()["largest"]
+        if found["kind"] == "model"
+    }
+    assert complete == {("model", jobs[0]): True, ("model", jobs[1]): False}
+
+
 def test_a_capture_was_last_used_when_its_job_was_last_heard_of(people: ServedApp) -> None:
     ann = Person(people.http, "ann")
     capture = ann.capture(5, 5)

@@ -58,6 +58,9 @@ class StoredRecord(Response):
     name: str | None = None
     bytes: int = Field(ge=0)
     files: int = Field(ge=0, description="Number of files in storage.")
+    complete: bool = Field(
+        default=True, description="False for what a job wrote of a model before it was cancelled or failed."
+    )
     last_used: Time = Field(
         description="When a file of it was last written, or a job that uses it was last heard of."
     )

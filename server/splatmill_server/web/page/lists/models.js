@@ -79,7 +79,7 @@ async function storage(inBin) {
       h("caption", {}, "The largest records"),
       h("thead", {}, h("tr", {}, ["What", "Name", "Last used", ...(expire ? ["Deleted"] : [])].map((text) => h("th", { scope: "col" }, text)), h("th", { scope: "col", class: "number" }, "Size"), h("td", {}))),
       h("tbody", {}, largest.map((/** @type {any} */ record) => h("tr", {},
-        h("td", {}, { capture: "Photos", job: "Checkpoints", model: "Model" }[/** @type {string} */ (record.kind)] ?? record.kind),
+        h("td", {}, kindOf(record)),
         h("td", {}, place(record)),
         h("td", { "data-label": "Last used" }, ago(record.last_used)),
         expire ? h("td", { "data-label": "Deleted" }, record.expires_at ? ago(record.expires_at) : "not by itself") : null,
@@ -98,11 +98,17 @@ function deletePhotos({ id, name, needed_by: user }) {
   }, "Delete");
 }
 
-/** @param {any} record */
+/** What a record in storage is, in words. @param {any} record */
+function kindOf({ kind, complete }) {
+  if (kind === "model" && !complete) return "Unfinished model";
+  return { capture: "Photos", job: "Checkpoints", model: "Model" }[/** @type {string} */ (kind)] ?? kind;
+}
+
+/** The name of a record in storage, which leads to its page; what there is of an unfinished model leads to its job. @param {any} record */
 function place(record) {
   const name = record.name || record.id.slice(0, 8);
   if (record.kind === "capture") return name;
-  return h("a", { href: `/${record.kind === "model" ? "models" : "jobs"}/${record.id}` }, name);
+  return h("a", { href: `/${record.kind === "model" && record.complete ? "models" : "jobs"}/${record.id}` }, name);
 }
 
 /** @param {{swatch: string, size: number}[]} kinds @param {number} whole */
