@@ -137,6 +137,28 @@ def test_a_tool_is_brought_into_sight_when_it_is_opened(phone: Visit) -> None:
     expect(page.get_by_role("heading", name="Measure", exact=True)).to_be_in_viewport()
 
 
+def test_visitors_are_told_of_touches_in_one_line_until_the_first(
+    service: Up, model: SmallModel, open_window: Open
+) -> None:
+    path = service.http.post(f"/v1/models/{model.id}/shares", json={"expires_in": "1h"}).json()["path"]
+    for address in (path, f"{path}/embed"):
+        visit = open_window(service, **PHONE)
+        page = visit.page
+        page.goto(address)
+        hint = page.locator("#view > .said")
+        expect(hint).to_have_text("Tap and drag to turn, pinch to zoom.")
+        box = hint.bounding_box()
+        assert box is not None
+        assert box["height"] < 40, "a line"
+        page.locator(".view[data-frames]").wait_for()
+        Fingers(visit).drag(middle(page), by=(0, -60))
+        expect(hint).to_be_empty()
+        expect(page.locator(".view .enter")).to_be_hidden()
+        page.get_by_role("button", name="How it is moved").tap()
+        expect(hint).to_contain_text("Pinch: nearer and farther.")
+        expect(hint).not_to_contain_text("W A S D")
+
+
 def test_downloads_can_be_read_on_a_phone(phone: Visit) -> None:
     page = phone.page
     section = page.locator("#downloads")

@@ -18,7 +18,7 @@
 import { bytes } from "./format.js";
 import { depthOfPixel } from "./viewer/depth.js";
 import { Pictures } from "./viewer/pictures_view.js";
-import { Controls, HELP } from "./viewer/controls.js";
+import { Controls, help } from "./viewer/controls.js";
 import { ViewerError } from "./viewer/errors.js";
 import { Overlay } from "./viewer/overlay.js";
 import { add, denseMiddle, dot, length, lookingAt, matrixOf, poseOf, projected, sub, surroundings, tangentsOf, times } from "./viewer/pose.js";
@@ -121,7 +121,7 @@ export class View extends EventTarget {
     this.element.tabIndex = 0;
     this.element.setAttribute("role", "application");
     this.element.setAttribute("aria-roledescription", "3D view");
-    this.element.setAttribute("aria-label", `${options.label ?? "The scene"}. ${HELP}`);
+    this.element.setAttribute("aria-label", `${options.label ?? "The scene"}. ${help()}`);
     this.canvas = document.createElement("canvas");
     const over = document.createElement("canvas");
     this.overlay = new Overlay(over);

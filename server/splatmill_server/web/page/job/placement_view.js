@@ -1,6 +1,6 @@
 // Cameras and points as structure from motion places them, from any side. It is drawn in 2D, so it needs no WebGL.
 
-import { Controls, HELP } from "../viewer/controls.js";
+import { Controls, help } from "../viewer/controls.js";
 import { Overlay } from "../viewer/overlay.js";
 import { add, dot, length, lookingAt, mean, poseOf, sub, surroundings, times, unit } from "../viewer/pose.js";
 
@@ -68,7 +68,7 @@ export class PlacementView {
     this.overlay.cameras = cameras;
     const specs = cameras.map(({ camera }) => camera);
     if (specs.length) this.settle(specs);
-    this.element.setAttribute("aria-label", `${cameras.length} cameras and ${placement.points_total} points. ${HELP}`);
+    this.element.setAttribute("aria-label", `${cameras.length} cameras and ${placement.points_total} points. ${help()}`);
     this.element.dataset.cameras = String(cameras.length);
     this.again();
   }

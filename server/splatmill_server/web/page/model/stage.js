@@ -5,7 +5,7 @@ import { byId, h, toggle } from "../dom.js";
 import { openModel } from "../opening.js";
 import { noticeOf, notify } from "../shell.js";
 import { GRADIENT } from "../viewer/depth.js";
-import { HELP } from "../viewer/controls.js";
+import { help } from "../viewer/controls.js";
 import { savePicture } from "../viewer/presented.js";
 import { Turning } from "../viewer/turning.js";
 import { Annotate } from "./annotate.js";
@@ -165,7 +165,7 @@ export class Stage {
   tell() {
     this.note.textContent = this.photo ? `The view of ${this.photo}.`
       : this.showing.cameras ? "Blue: trained on. Orange: held out. Click the tip of a camera to look from there."
-        : this.view?.whyNot || HELP;
+        : this.view?.whyNot || help();
   }
 
   /** @param {boolean} on */

@@ -37,9 +37,20 @@ const KEYS = new Map(
   ]),
 );
 
-export const HELP =
+const BY_HAND =
   "Drag or arrow keys: turn. Wheel, pinch or + and -: nearer and farther. Right button, Shift or two fingers: move " +
   "sideways. Double click: turn about that point. W A S D Q E: fly. Home: back to the start.";
+const BY_FINGERS = "One finger: turn. Pinch: nearer and farther. Two fingers: move sideways. Double tap: turn about that point.";
+
+/** Whether this is a phone or a tablet, whose views fingers move. */
+export function hasTouch() {
+  return matchMedia("(pointer: coarse)").matches;
+}
+
+/** How a view is moved, by mouse and keys or by fingers. */
+export function help() {
+  return hasTouch() ? BY_FINGERS : BY_HAND;
+}
 
 /**
  * @typedef {Object} Movable  what is moved

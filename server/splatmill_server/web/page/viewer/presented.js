@@ -16,12 +16,13 @@
  * @property {{keyframes: {camera_to_world: number[][], fov_y_deg: number}[], closed: boolean} | null} [camera_path]
  */
 import { Annotations } from "./annotations.js";
-import { HELP } from "./controls.js";
+import { hasTouch, help } from "./controls.js";
 import { measuredLines } from "./lengths.js";
 import { Turning } from "./turning.js";
 
-/** What visitors are told until they have moved the view. */
-const HINT = "Drag to turn, wheel or pinch to come nearer, double click to turn about a point.";
+/** What visitors are told until they have moved or touched the view. */
+const HINT = "Drag to turn, wheel to come nearer, double click to turn about a point.";
+const HINT_OF_TOUCH = "Tap and drag to turn, pinch to zoom.";
 
 /** The pictures on the buttons, as paths in a square of 24. */
 const ICONS = {
@@ -50,9 +51,10 @@ export function present(box, view, presentation, name) {
   const hint = document.createElement("p");
   hint.className = "said above-bar";
   hint.setAttribute("role", "status");
-  hint.textContent = HINT;
+  hint.textContent = hasTouch() ? HINT_OF_TOUCH : HINT;
   const hide = () => {
     hint.textContent = "";
+    view.element.classList.add("told"); // the view's own hint of touches does not take its place
   };
 
   let shown = false;
@@ -75,7 +77,7 @@ export function present(box, view, presentation, name) {
     bar.append(button("whole", "Full screen", () => (document.fullscreenElement ? document.exitFullscreen() : box.requestFullscreen())));
   }
   bar.append(button("help", "How it is moved", () => {
-    hint.textContent = hint.textContent === HELP ? "" : HELP;
+    hint.textContent = hint.textContent === help() ? "" : help();
   }));
   view.addEventListener("hand", hide);
   view.element.addEventListener("pointerdown", hide);
