@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import re
 import threading
 from collections.abc import Iterator
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -152,6 +153,30 @@ def test_only_the_viewer_alone_can_be_framed_by_a_page_of_others(
         expect(inside.locator("#view .view")).to_be_visible()
         expect(others.page.frame_locator("#page").locator("#title")).to_have_count(0)
         assert [text for text in others.watched.complaints if "frame" in text.lower()]
+
+
+def test_the_frame_is_as_wide_as_its_column_and_keeps_its_shape(
+    link: dict[str, Any], service: Up, open_window: Open, tmp_path: Path
+) -> None:
+    visit = open_window(service)
+    visit.page.goto(link["path"])
+    embed = visit.page.get_by_label("HTML of a frame")
+    expect(embed).to_have_value(re.compile("<iframe "))
+    frame = embed.input_value()
+    (tmp_path / "index.html").write_text(
+        f"""<!doctype html><title>a page of others</title><link rel="icon" href="data:,"><body style="margin: 0">
+        <div id="column">{frame}</div>"""
+    )
+    with elsewhere(tmp_path) as address:
+        others = open_window(address)
+        others.watched.allow("request to another host")
+        others.page.goto("/")
+        for column, width in ((320, 320), (1200, 800)):
+            others.page.evaluate(f"document.getElementById('column').style.width = '{column}px'")
+            box = others.page.locator("iframe").bounding_box()
+            assert box is not None
+            assert box["width"] == width
+            assert box["height"] == pytest.approx(width * 5 / 8, abs=1)
 
 
 def test_an_ended_link_says_so(

@@ -81,13 +81,16 @@ export async function openSharing(address, name) {
   await tried(show);
 }
 
+/** A frame fits its column, at most as wide as its attribute says, which pages that remove styles follow. */
+const FRAME_STYLE = "width: 100%; max-width: 800px; height: auto; aspect-ratio: 8 / 5; border: 0";
+
 /**
  * The HTML of a frame that shows a shared model alone.
  * @param {string} address of its link @param {string} name of the model
  */
 export function frameOf(address, name) {
   const title = name.replace(/[&"<>]/g, (sign) => `&#${sign.charCodeAt(0)};`);
-  return `<iframe src="${address}/embed" width="800" height="500" title="${title}" allow="fullscreen" loading="lazy"></iframe>`;
+  return `<iframe src="${address}/embed" width="800" height="500" style="${FRAME_STYLE}" title="${title}" allow="fullscreen" loading="lazy"></iframe>`;
 }
 
 /** The address of a new link, which the server cannot show again. @param {string} address @param {string} name of the model */
