@@ -108,6 +108,18 @@ def test_the_model_is_compared_with_its_held_out_photos(service: Up, model: Smal
     assert int(slider.input_value()) == pytest.approx(75, abs=1)
 
 
+def test_the_tools_of_the_view_are_in_sight(shown: Page) -> None:
+    toolbar = shown.locator("#toolbar").bounding_box()  # in a window of 1280 by 800 pixels
+    assert toolbar is not None
+    assert toolbar["y"] + toolbar["height"] < 800
+    title, share = (
+        each.bounding_box() for each in (shown.locator("#title"), shown.get_by_role("button", name="Share"))
+    )
+    assert title is not None
+    assert share is not None
+    assert abs(title["y"] + title["height"] / 2 - share["y"] - share["height"] / 2) < 20, "they share a line"
+
+
 def test_distances_are_measured_in_a_unit_that_is_set(shown: Page) -> None:
     shown.get_by_role("button", name="Measure").click()
     panel = shown.locator("form.panel").first

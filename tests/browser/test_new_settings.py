@@ -99,3 +99,16 @@ def test_a_time_that_is_too_short_is_refused_where_it_is(
     expect(page.locator("#problem")).to_contain_text("Time for everything: The fastest of the jobs")
     expect(page.get_by_label("Time for everything")).to_be_focused()
     assert {address.rsplit("/v1/")[1] for address in addresses} == {"estimate"}
+
+
+def test_the_first_settings_are_in_sight_once_there_are_photos(visit: Visit, photos: Path) -> None:
+    page = opened(visit.page)  # 1280 by 800 pixels
+    give(page, photos)
+    page.get_by_text("How this was derived").wait_for()
+    preset = page.locator(".segments").first.bounding_box()
+    bar = page.locator("#go").bounding_box()
+    assert preset is not None
+    assert bar is not None
+    assert page.evaluate("scrollY") == 0
+    assert preset["y"] + preset["height"] < bar["y"], "the button's bar does not cover them"
+    assert bar["y"] + bar["height"] == 800, "nothing is seen below the bar"
