@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from playwright.sync_api import expect
+from playwright.sync_api import Page, expect
 
 from tests.browser.conftest import Open, SmallModel
 from tests.browser.test_model_page import WAIT, show
@@ -95,6 +95,16 @@ def test_visitors_begin_with_the_view_that_was_chosen(
     assert kept(service, model)["start_view"] is None
 
 
+def drawn(page: Page) -> bool:
+    """Whether anything is drawn over the view: lines and their labels."""
+    over = """() => {
+      const canvas = document.querySelectorAll(".view > canvas")[1];
+      const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+      return data.some((value) => value > 0);
+    }"""
+    return bool(page.evaluate(over))
+
+
 def test_measurements_and_annotations_are_kept_with_the_model(
     service: Up, model: SmallModel, open_window: Open
 ) -> None:
@@ -135,7 +145,13 @@ def test_measurements_and_annotations_are_kept_with_the_model(
     other = open_window(service).page
     show(other, model)
     expect(other.locator(".pin")).to_have_text("1")
-    other.get_by_role("button", name="Measure").click()
+    wait_for(lambda: drawn(other))  # from the start
+    toggle = other.get_by_role("button", name="Measurements")
+    expect(toggle).to_have_attribute("aria-pressed", "true")
+    toggle.click()
+    wait_for(lambda: not drawn(other))
+    other.get_by_role("button", name="Measure", exact=True).click()
+    wait_for(lambda: drawn(other))
     entry = other.get_by_role("form", name="Measure").get_by_role("listitem")
     expect(entry).to_contain_text("the plate: 12 cm")
     path = link(service, model)
@@ -146,8 +162,11 @@ def test_measurements_and_annotations_are_kept_with_the_model(
         expect(other.locator(".pin-text")).to_have_text("The <i>top</i>")
         expect(other.locator(".pin-text")).to_be_visible()
         marks = other.get_by_role("button", name="Measurements")
-        marks.click()
         expect(marks).to_have_attribute("aria-pressed", "true")
+        wait_for(lambda: drawn(other))
+        marks.click()
+        expect(marks).to_have_attribute("aria-pressed", "false")
+        wait_for(lambda: not drawn(other))
     show(other, model)
     other.get_by_role("button", name="Annotate").click()
     other.get_by_role("button", name="Delete annotation 1").click()

@@ -56,7 +56,7 @@ export class Annotate extends Aim {
   }
 
   draw() {
-    if (this.on) this.view?.mark({ points: this.point ? [this.point] : [], lines: [] });
+    if (this.on) this.view?.mark({ points: this.point ? [this.point] : [] });
     else if (!this.stage.measure.on) this.view?.mark({ points: [] });
     this.pins?.show(this.annotations);
     this.list.replaceChildren(...this.annotations.map(({ point, text }, index) => h("li", {},

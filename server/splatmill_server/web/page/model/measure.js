@@ -1,7 +1,7 @@
 // Measuring: the distance between two points of the scene, a known distance that gives the scene its scale, and the
 // measurements that are kept with the model.
 
-import { h } from "../dom.js";
+import { h, toggle } from "../dom.js";
 import { length, sub } from "../viewer/pose.js";
 import { lengthText, measuredLines } from "../viewer/lengths.js";
 import { Aim } from "./aim.js";
@@ -20,6 +20,14 @@ export class Measure extends Aim {
     this.known = h("input", { id: "known", type: "number", min: 0, step: "any", class: "narrow-field", inputmode: "decimal" });
     this.unit = h("input", { id: "unit", class: "narrow-field", maxlength: 12, value: this.scale?.unit ?? "cm" });
     this.name = h("input", { id: "measured", class: "narrow-field", maxlength: 200, autocomplete: "off" });
+    /** Whether the measurements that are kept are shown while nothing is measured. */
+    this.shown = true;
+    this.showButton = toggle("Measurements", (on) => {
+      this.shown = on;
+      this.draw();
+    });
+    this.showButton.setAttribute("aria-pressed", "true");
+    this.showButton.hidden = true;
     this.keepButton = h("button", { type: "button", onclick: () => void this.keep() }, "Keep this measurement");
     this.list = h("ul", { class: "kept", "aria-label": "Measurements" });
     this.panel.addEventListener("submit", (event) => {
@@ -85,10 +93,11 @@ export class Measure extends Aim {
 
   draw() {
     const { measured, measurements, scale } = this;
-    this.view?.mark(this.on ? {
-      points: this.points,
-      lines: [...measuredLines(measurements, scale), ...(measured === null ? [] : [{ points: this.points, label: this.distance(measured) }])],
-    } : { points: [], lines: [] });
+    const lines = this.on || this.shown ? measuredLines(measurements, scale) : [];
+    if (this.on && measured !== null) lines.push({ points: this.points, label: this.distance(measured) });
+    if (this.on) this.view?.mark({ points: this.points, lines });
+    else this.view?.mark(this.stage.annotate.on ? { lines } : { points: [], lines });
+    this.showButton.hidden = !measurements.length;
     this.list.replaceChildren(...measuredLines(measurements, scale).map(({ label }, index) => h("li", {},
       h("span", { class: "number" }, label),
       h("button", { type: "button", class: "quiet small", "aria-label": `Delete the measurement ${label}`, onclick: () => void this.remove(index) }, "Delete"))));

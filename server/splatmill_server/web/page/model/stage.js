@@ -60,6 +60,7 @@ export class Stage {
       this.shell ? this.farButton : "",
       this.turnButton,
       this.measure.button,
+      this.measure.showButton,
       this.annotate.button,
       this.edit.button,
       this.path.button,

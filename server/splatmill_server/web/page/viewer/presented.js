@@ -57,13 +57,16 @@ export function present(box, view, presentation, name) {
     view.element.classList.add("told"); // the view's own hint of touches does not take its place
   };
 
-  let shown = false;
-  const marks = button("marks", "Measurements", () => {
-    shown = !shown;
+  let shown = true;
+  const mark = () => {
     marks.setAttribute("aria-pressed", String(shown));
     view.mark({ lines: shown ? measuredLines(measurements, scale) : [] });
+  };
+  const marks = button("marks", "Measurements", () => {
+    shown = !shown;
+    mark();
   });
-  marks.setAttribute("aria-pressed", "false");
+  mark();
 
   bar.append(button("start", "Start view", () => {
     turning.turn(false);
