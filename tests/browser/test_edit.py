@@ -8,13 +8,14 @@ Does not prove what an edit keeps (tests/worker/render_service/test_edit.py), no
 from __future__ import annotations
 
 import io
+import re
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 from PIL import Image
-from playwright.sync_api import Locator, Page, expect
+from playwright.sync_api import Locator, Page, Route, expect
 
 from tests.browser.conftest import SmallModel, Visit
 from tests.browser.test_model_page import WAIT, show
@@ -80,6 +81,54 @@ def test_the_view_shows_what_is_left_out(panel: Locator, page: Page) -> None:
     assert picture(page).mean() < 0.95 * whole.mean(), "what lies outside is not drawn"
     tool.click()
     assert differs(picture(page), closed) < 1e-3, "the tool leaves the view as it was"
+
+
+def test_what_makes_the_new_model_is_in_sight_with_what_it_does(panel: Locator, page: Page) -> None:
+    def in_window(element: Locator) -> bool:
+        box = element.bounding_box()  # in a window of 1280 by 800 pixels
+        return box is not None and 0 <= box["y"] <= box["y"] + box["height"] <= 800
+
+    make = panel.get_by_role("button", name="Make a new model")
+    panel.get_by_role("heading").scroll_into_view_if_needed()
+    assert in_window(make)
+    assert in_window(panel.get_by_role("heading", name="Crop and clean")), (
+        "the form's beginning is in sight too"
+    )
+    panel.get_by_label("Least opacity").fill("0.2")
+    panel.get_by_label("Keep only what lies in the box").uncheck()
+    panel.get_by_role("button", name="Measure what it does").click()
+    said = panel.get_by_role("status")
+    expect(said).to_contain_text(
+        re.compile(r"Gaussians would be left out, and [\d,]+ would stay:"), timeout=WAIT
+    )
+    gone, before, rest = (
+        int(n.replace(",", "")) for n in re.findall(r"\d[\d,]*(?![.\d])", said.inner_text())[:3]
+    )
+    assert gone + rest == before
+    assert in_window(said)
+    # What the keyboard reaches is not below the foot.
+    for field in ("Largest size", "What is left out is"):
+        panel.get_by_label(field).focus()
+        box, foot = panel.get_by_label(field).bounding_box(), panel.locator(".foot").bounding_box()
+        assert box is not None
+        assert foot is not None
+        assert box["y"] + box["height"] <= foot["y"]
+
+
+def test_the_axes_of_an_upright_model_have_words_that_hold_from_all_sides(
+    service: Up, model: SmallModel, page: Page
+) -> None:
+    def with_frame(route: Route) -> None:
+        answer = route.fetch()
+        body = answer.json()
+        body["files"].append({"name": "frame.json", "size": 2})
+        route.fulfill(response=answer, json=body)
+
+    page.route(f"**/v1/models/{model.id}", with_frame)
+    show(page, model)
+    page.get_by_role("button", name="Crop and clean").click()
+    legends = page.get_by_role("form", name="Crop and clean").locator(".box-ends legend")
+    expect(legends).to_have_text(["x, level", "y, downwards", "z, level"])
 
 
 def test_the_box_is_moved_by_its_handles_and_back(panel: Locator, page: Page) -> None:

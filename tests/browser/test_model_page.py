@@ -344,7 +344,7 @@ def test_a_crop_makes_a_new_model_and_keeps_the_first(service: Up, model: SmallM
     ends[0].press("Tab")
     assert shown.evaluate("document.querySelectorAll('.view canvas').length") == 2
     panel.get_by_role("button", name="Measure what it does").click()
-    said = re.compile(r"^[\d,]+ of [\d,]+ Gaussians would be left out: the photos show what is left out, so ")
+    said = re.compile(r"^[\d,]+ of [\d,]+ Gaussians would be left out, and [\d,]+ would stay: the ")
     expect(panel.get_by_role("status").locator("p")).to_have_text(said, timeout=WAIT)
     assert service.http.get("/v1/models").json()["models"] == models, "a preview makes no model"
     panel.get_by_role("button", name="Make a new model").click()

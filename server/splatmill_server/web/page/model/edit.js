@@ -3,7 +3,7 @@
 
 import { send } from "../api.js";
 import { h, toggle } from "../dom.js";
-import { number } from "../format.js";
+import { count, number } from "../format.js";
 import { noticeOf } from "../shell.js";
 import { BoxHandles, boxAround, boxOf } from "../viewer/box_handles.js";
 import { LOADING } from "../viewer/errors.js";
@@ -16,9 +16,9 @@ import { Selecting } from "./selecting.js";
  * @import {Vec} from "../viewer/pose.js"
  */
 
-/** The axes of a model, and their directions where its frame.json says how they were chosen. */
+/** The axes of a model, and what is true of them from wherever they are seen, where its frame.json says how they were chosen. */
 const AXES = ["x", "y", "z"];
-const DIRECTED = ["x, to the right", "y, downwards", "z, to the front"];
+const DIRECTED = ["x, level", "y, downwards", "z, level"];
 /** The box is laid around what lies nearer to where the view turns about than the camera does, over its distance. */
 const REACH = 0.8;
 /** Where the server draws: length of the box over the width or height that is in sight there. */
@@ -80,9 +80,8 @@ export class Edit {
         h("div", { class: "field" }, h("label", { for: "edit-opacity" }, "Least opacity, 0 to 0.99"), this.opacity),
         h("div", { class: "field" }, this.sizeLabel, this.size),
         h("div", { class: "field" }, h("label", { for: "edit-look" }, "What is left out is"), this.look)),
-      h("div", { class: "row" }, this.measureButton, this.makeButton, this.undoButton),
-      this.state,
-      h("p", { class: "hint" }, "This model is kept. What opacity and size do is measured on up to 16 held-out photos. They show what a box or a selection leaves out, so they do not measure the quality of a crop."));
+      h("p", { class: "hint" }, "This model is kept. What opacity and size do is measured on up to 16 held-out photos. They show what a box or a selection leaves out, so they do not measure the quality of a crop."),
+      h("div", { class: "foot" }, this.state, h("div", { class: "row" }, this.measureButton, this.makeButton, this.undoButton)));
   }
 
   /** @param {View} view */
@@ -221,9 +220,10 @@ export class Edit {
 
 /** @param {any} done the answer of the server */
 function said(done) {
-  const gone = done.gaussians_before - done.gaussians;
+  const gone = `${number(done.gaussians_before - done.gaussians)} of ${count(done.gaussians_before, "Gaussian")}`;
   const error = done.psnr === null ? "there are no photos to measure it on"
     : done.crops ? "the photos show what is left out, so they do not measure what is left"
     : `${done.psnr_before.toFixed(2)} dB before, ${done.psnr.toFixed(2)} dB after`;
-  return `${number(gone)} of ${number(done.gaussians_before)} Gaussians ${done.model ? "are left out" : "would be left out"}: ${error}.`;
+  return done.model ? `The new model has ${count(done.gaussians, "Gaussian")}, without ${gone}: ${error}.`
+    : `${gone} would be left out, and ${number(done.gaussians)} would stay: ${error}.`;
 }
