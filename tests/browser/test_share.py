@@ -52,7 +52,17 @@ def test_links_are_made_and_revoked_on_the_page(service: Up, model: SmallModel, 
     whole = httpx.get(f"{dialog.get_by_label('The link').input_value()}/model").json()
     photos = {file["name"] for file in whole["files"]} - {file["name"] for file in bare["files"]}
     assert photos == {"held_out/000.webp", "held_out/001.webp", "report.html"}
-    expect(dialog).to_contain_text("Only this machine reaches 127.0.0.1")
+    reach = dialog.get_by_text("Only this machine reaches 127.0.0.1")
+    shown = dialog.get_by_label("The link")
+    expect(shown).to_be_focused()
+    assert shown.evaluate("(field) => getSelection().toString() === field.value")
+    boxes = [
+        each.bounding_box()
+        for each in (dialog, reach, shown, dialog.get_by_role("button", name="Copy the HTML"))
+    ]
+    around, hint, address, last = [box for box in boxes if box is not None]
+    assert around["y"] <= hint["y"] < hint["y"] + hint["height"] <= address["y"], "it is read before the link"
+    assert last["y"] + last["height"] <= around["y"] + around["height"], "all of it lies in the dialog's window"
     entry = dialog.get_by_role("listitem").filter(has_text="for mum")
     expect(entry).to_contain_text("valid until")
     entry.get_by_role("button", name="Revoke").click()

@@ -70,9 +70,10 @@ export async function openSharing(address, name) {
       void makeSmallFile(address); // before visitors come
       latest = share.id;
       made.replaceChildren(link(`${location.origin}${at(share.path)}`, name));
-      made.scrollIntoView({ block: "nearest" });
       label.value = "";
       await show();
+      made.querySelector("input")?.focus({ preventScroll: true });
+      made.scrollIntoView({ block: "nearest" });
     });
   });
   dialog.addEventListener("close", () => dialog.remove());
@@ -95,10 +96,12 @@ export function frameOf(address, name) {
 
 /** The address of a new link, which the server cannot show again. @param {string} address @param {string} name of the model */
 function link(address, name) {
-  const shown = h("input", { id: "share-link", readonly: true, value: address, onfocus: () => shown.select() });
+  const shown = h("input", { id: "share-link", readonly: true, value: address, "aria-describedby": isLoopback(location.hostname) && "share-reach", onfocus: () => shown.select() });
   const frame = h("textarea", { id: "share-frame", rows: 3, readonly: true, spellcheck: "false", onfocus: () => frame.select() }, frameOf(address, name));
   const [said, saidOfFrame] = [0, 1].map(() => h("span", { class: "hint", role: "status" }));
   return h("div", { class: "field" },
+    isLoopback(location.hostname) && h("p", { class: "hint", id: "share-reach" },
+      `Only this machine reaches ${location.host}. For others, make the link where this page is open under the name or the network address of the server.`),
     h("label", { for: "share-link" }, "The link, which is shown only now"),
     shown,
     h("div", { class: "row" },
@@ -106,9 +109,7 @@ function link(address, name) {
       h("a", { class: "button small", href: address, target: "_blank", rel: "noopener" }, "Open"), said),
     h("label", { for: "share-frame" }, "To show it on a page of yours, HTML of a frame"),
     frame,
-    h("div", { class: "row" }, h("button", { class: "small", type: "button", onclick: () => copy(frame, saidOfFrame) }, "Copy the HTML"), saidOfFrame),
-    isLoopback(location.hostname)
-      && h("p", { class: "hint" }, `Only this machine reaches ${location.host}. For others, make the link where this page is open under the name or the network address of the server.`));
+    h("div", { class: "row" }, h("button", { class: "small", type: "button", onclick: () => copy(frame, saidOfFrame) }, "Copy the HTML"), saidOfFrame));
 }
 
 /**
