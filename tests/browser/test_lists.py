@@ -5,9 +5,12 @@ What a single job or model shows is tested with those pages.
 
 from __future__ import annotations
 
+from datetime import datetime
+from zoneinfo import ZoneInfo
+
 from playwright.sync_api import Page, expect
 
-from tests.browser.conftest import SmallModel
+from tests.browser.conftest import Open, SmallModel
 from tests.support.up import Up
 from tests.support.waiting import wait_for
 
@@ -110,6 +113,30 @@ def test_what_a_cancelled_job_left_of_a_model_leads_to_the_job(
     unfinished = rows.filter(has_text="Unfinished model")
     expect(unfinished.get_by_role("link", name="series 00")).to_have_attribute("href", f"/jobs/{job}")
     expect(rows.locator(f"a[href='/models/{model.id}']")).to_be_visible()
+
+
+def test_names_and_times_are_written_alike_on_all_pages_in_any_language(
+    service: Up, model: SmallModel, open_window: Open
+) -> None:
+    page = open_window(service, locale="de-DE", timezone_id="Asia/Tokyo").page
+    body = {"capture": model.capture, "options": {"steps": 20_000}}
+    job = service.http.post("/v1/jobs", json=body).json()["id"]
+    service.http.post(f"/v1/jobs/{job}/cancel")
+    created = datetime.fromisoformat(service.ended(job)["created_at"]).astimezone(ZoneInfo("Asia/Tokyo"))
+    moment = f"{created:%b} {created.day}, {created.year}, {created:%H:%M}"
+    name = f"Job {job[:8]}"
+    page.goto("/jobs")
+    entry = page.get_by_role("list", name="Jobs").get_by_role("listitem").filter(has_text=name)
+    expect(entry.locator("time")).to_have_attribute("title", moment)
+    expect(entry.get_by_role("button", name=f"Favourite: {name}")).to_be_visible()
+    entry.get_by_role("link").click()
+    expect(page.get_by_role("heading", level=1)).to_have_text(name)
+    expect(page.locator("#facts")).to_contain_text(moment)
+    made = datetime.fromisoformat(service.http.get(f"/v1/models/{model.id}").json()["created_at"])
+    made = made.astimezone(ZoneInfo("Asia/Tokyo"))
+    page.goto(f"/models/{model.id}")
+    title = f"{made:%b} {made.day}, {made.year}, {made:%H:%M}"
+    expect(page.locator("#lead time")).to_have_attribute("title", title)
 
 
 def test_photos_are_deleted_and_restored(service: Up, model: SmallModel, page: Page) -> None:

@@ -1,6 +1,7 @@
 // Elements as function calls. Text is set as text, never as HTML, so names chosen by users cannot become markup.
 
 import { at } from "./address.js";
+import { ago, moment } from "./format.js";
 
 /** @typedef {Node | string | number | false | null | undefined} Child */
 
@@ -33,6 +34,11 @@ export function h(tag, attributes = {}, ...children) {
  */
 export function term(text, id) {
   return h("a", { class: "term", href: `/glossary#${id}` }, text);
+}
+
+/** How long ago something happened, with the moment as its title. @param {string} iso */
+export function when(iso) {
+  return h("time", { datetime: iso, title: moment(iso) }, ago(iso));
 }
 
 /**

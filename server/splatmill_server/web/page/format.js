@@ -7,6 +7,14 @@ export function number(count) {
   return whole.format(Math.round(count));
 }
 
+/**
+ * The name of a record, or what it is and the beginning of its id where it has none: "Model 3c4207ce".
+ * @param {{name?: string | null, id: string}} record @param {"Job" | "Model" | "Photos" | "Link"} kind
+ */
+export function nameOf({ name, id }, kind) {
+  return name || `${kind} ${id.slice(0, 8)}`;
+}
+
 /** How many there are of something: "1 photo", "1,200 photos". @param {number} many @param {string} noun in the singular */
 export function count(many, noun) {
   return `${number(many)} ${noun}${Math.round(many) === 1 ? "" : "s"}`;
@@ -35,9 +43,23 @@ export function decibels(psnr) {
   return psnr === null || psnr === undefined ? "not measured" : `${psnr.toFixed(1)} dB`;
 }
 
-/** A moment, in the reader's own time zone. @param {string} iso */
+const moments = new Intl.DateTimeFormat("en", { dateStyle: "medium", timeStyle: "short", hourCycle: "h23" });
+const days = new Intl.DateTimeFormat("en", { dateStyle: "long" });
+const clocks = new Intl.DateTimeFormat("en", { timeStyle: "medium", hourCycle: "h23" });
+
+/** A moment, in the reader's own time zone: "Nov 27, 2026, 13:42". @param {string} iso */
 export function moment(iso) {
-  return new Intl.DateTimeFormat(undefined, { dateStyle: "medium", timeStyle: "short" }).format(new Date(iso));
+  return moments.format(new Date(iso));
+}
+
+/** The day of a moment: "November 27, 2026". @param {number} given milliseconds since 1970 */
+export function day(given) {
+  return days.format(given);
+}
+
+/** The time of day of a moment: "13:42:05". @param {string} iso */
+export function clock(iso) {
+  return clocks.format(new Date(iso));
 }
 
 /** How long ago a moment was: "3 minutes ago". @param {string} iso */

@@ -2,6 +2,7 @@
 
 import { send } from "./api.js";
 import { h } from "./dom.js";
+import { nameOf } from "./format.js";
 import { noticeOf, notify } from "./shell.js";
 
 /** Characters of a name and of a tag, and tags of a record, as the server allows. */
@@ -26,7 +27,7 @@ export function labelButton(address, record, changed) {
  * @param {(record: any) => void} changed called with the record after the change
  */
 export function starButton(address, record, changed) {
-  const name = record.name || record.id.slice(0, 8);
+  const name = nameOf(record, address.includes("/jobs/") ? "Job" : "Model");
   const button = h("button", { type: "button", class: "star", "data-focus": "star", title: "Favourite", "aria-label": `Favourite: ${name}`, onclick: async () => {
     try {
       const after = await send("PATCH", address, { favourite: button.getAttribute("aria-pressed") !== "true" });

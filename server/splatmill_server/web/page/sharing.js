@@ -3,7 +3,7 @@
 import { at, isLoopback } from "./address.js";
 import { get, send } from "./api.js";
 import { h } from "./dom.js";
-import { moment } from "./format.js";
+import { moment, nameOf } from "./format.js";
 import { noticeOf } from "./shell.js";
 import { makeSmallFile } from "./viewer/small_file.js";
 
@@ -50,9 +50,9 @@ export async function openSharing(address, name) {
   async function show() {
     const { shares } = await get(`${address}/shares`);
     list.replaceChildren(...shares.map((/** @type {any} */ share) => h("li", { class: "row" },
-      h("span", {}, share.name || `Link ${share.id}`),
+      h("span", {}, nameOf(share, "Link")),
       h("span", { class: "hint" }, share.revoked_at ? `revoked ${moment(share.revoked_at)}` : `${share.active ? "valid until" : "expired"} ${moment(share.expires_at)}${share.photos ? ", with photos" : ""}`),
-      share.active && h("button", { class: "small push", type: "button", onclick: () => revoke(share) }, "Revoke", h("span", { class: "visually-hidden" }, ` ${share.name || share.id}`)))));
+      share.active && h("button", { class: "small push", type: "button", onclick: () => revoke(share) }, "Revoke", h("span", { class: "visually-hidden" }, ` ${nameOf(share, "Link")}`)))));
   }
 
   /** @param {any} share */

@@ -3,7 +3,7 @@
 import { get, modelAddress } from "../api.js";
 import { byId, h } from "../dom.js";
 import { figures } from "../figures.js";
-import { decibels } from "../format.js";
+import { decibels, nameOf } from "../format.js";
 import { openModel } from "../opening.js";
 import { noticeOf, startShell } from "../shell.js";
 import { sameWorld } from "./same_world.js";
@@ -36,17 +36,17 @@ async function load(address) {
 /** @param {Side[]} sides */
 async function show(sides) {
   byId("whole").hidden = false;
-  document.title = `${sides.map(nameOf).join(" and ")} - Splatmill`;
+  document.title = `${sides.map(({ model }) => nameOf(model, "Model")).join(" and ")} - Splatmill`;
   const together = sameWorld(sides[0].cameras, sides[1].cameras);
   byId("said").textContent = together
     ? "Both are seen by one camera: move either of them."
     : "These models have no coordinates in common, as they were not made from the same photos with the same cameras. Each is moved by itself.";
   const boxes = sides.map(() => h("div", { class: "stage" }));
   byId("pair").append(...sides.map((side, i) => h("figure", {}, boxes[i], h("figcaption", {},
-    h("a", { href: `/models/${encodeURIComponent(side.model.id)}` }, nameOf(side)), h("div", { class: "muted" }, figures(side.model))))));
+    h("a", { href: `/models/${encodeURIComponent(side.model.id)}` }, nameOf(side.model, "Model")), h("div", { class: "muted" }, figures(side.model))))));
   const views = await Promise.all(sides.map(async (side, i) => {
     try {
-      return await openModel(boxes[i], { ...side, files: side.model.files }, { label: nameOf(side) });
+      return await openModel(boxes[i], { ...side, files: side.model.files }, { label: nameOf(side.model, "Model") });
     } catch (error) {
       boxes[i].append(noticeOf(/** @type {Error} */ (error)));
       return null;
@@ -60,11 +60,6 @@ async function show(sides) {
   }
   showPhotos(sides, together, views);
   document.documentElement.dataset.ready = "";
-}
-
-/** @param {Side} side */
-function nameOf({ model }) {
-  return model.name || `Model ${model.id.slice(0, 8)}`;
 }
 
 /** Let one view show what another sees, now. @param {import("../viewer.js").View} from @param {import("../viewer.js").View} to */
@@ -92,7 +87,7 @@ function showPhotos(sides, together, views) {
   byId("photos").hidden = false;
   byId("photos").append(h("h2", { id: "photos-title" }, "Photos that neither has seen"),
     h("div", { class: "scroll", tabindex: 0, role: "region", "aria-labelledby": "photos-title" }, h("table", { class: "table" },
-      h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Photo"), sides.map((side) => h("th", { scope: "col", class: "number" }, nameOf(side))))),
+      h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Photo"), sides.map((side) => h("th", { scope: "col", class: "number" }, nameOf(side.model, "Model"))))),
       h("tbody", {}, names.map((name) => h("tr", {},
         h("td", {}, h("button", { type: "button", class: "quiet small", onclick: () => look(name) }, `Look from ${name}`)),
         held.map((cameras) => h("td", { class: "number" }, decibels(cameras.get(name).psnr)))))))));

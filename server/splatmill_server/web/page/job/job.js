@@ -4,7 +4,7 @@ import { Problem, follow, get, idOfPage, send } from "../api.js";
 import { ErrorChart } from "../chart.js";
 import { byId, h } from "../dom.js";
 import { figures } from "../figures.js";
-import { bytes, count, moment, number, seconds } from "../format.js";
+import { bytes, count, moment, nameOf, number, seconds } from "../format.js";
 import { CANCELLING, FINAL, badgeKind, badgeText } from "../job_states.js";
 import { labelButton, starButton, tagLinks } from "../labels.js";
 import { titleOf } from "../new/titles.js";
@@ -82,7 +82,7 @@ function begin() {
 }
 
 function showName() {
-  byId("name").textContent = job.name || `Job ${id}`;
+  byId("name").textContent = nameOf(job, "Job");
   byId("tags").replaceChildren(...[tagLinks(job, "/jobs")].filter((list) => list !== null));
 }
 
@@ -101,7 +101,7 @@ function ended() {
     void makeSmallFile(`/v1/models/${encodeURIComponent(job.model ?? id)}`); // before the model's page asks for it
   }
   byId("notify").replaceChildren();
-  if (notifies) showNotification(job.name || `Job ${id}`, `${badgeText(course.state, false)}.`);
+  if (notifies) showNotification(nameOf(job, "Job"), `${badgeText(course.state, false)}.`);
   notifies = false;
 }
 
@@ -213,7 +213,7 @@ function draw() {
 }
 
 function pageTitle() {
-  const name = job.name || `Job ${id}`;
+  const name = nameOf(job, "Job");
   const { progress } = course;
   if (course.final || !progress?.total) return `${name}: ${badgeText(course.state, false).toLowerCase()}`;
   return `${Math.floor((100 * progress.done) / progress.total)} % of ${stageName(progress.stage).toLowerCase()}: ${name}`;

@@ -1,6 +1,7 @@
 // The log of a job: its last lines, warnings first to be seen, and the whole as a file.
 
 import { h } from "../dom.js";
+import { clock } from "../format.js";
 
 /** @typedef {{at: string, level: string, message: string, about?: string | null}} Line */
 
@@ -20,7 +21,7 @@ export function showLog(list, lines) {
 /** @param {Line} line */
 function itemOf({ at, level, message }) {
   return h("li", { "data-level": level },
-    h("time", { datetime: at, class: "muted number" }, new Date(at).toLocaleTimeString()), " ",
+    h("time", { datetime: at, class: "muted number" }, clock(at)), " ",
     level !== "info" && level !== "debug" && h("strong", {}, `${level}: `), message);
 }
 

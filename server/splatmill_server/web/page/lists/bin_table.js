@@ -2,8 +2,8 @@
 
 import { binned } from "../bin.js";
 import { get, send } from "../api.js";
-import { h } from "../dom.js";
-import { ago } from "../format.js";
+import { h, when } from "../dom.js";
+import { nameOf } from "../format.js";
 import { confirmAction, notify } from "../shell.js";
 
 /**
@@ -30,12 +30,13 @@ export async function showBin(section, changed) {
 
 /** @param {any} entry @param {() => unknown} changed */
 function row(entry, changed) {
-  const name = entry.name || entry.id.slice(0, 8);
+  const what = entry.kind === "capture" ? "Photos" : entry.model ? "Model" : "Job";
+  const name = nameOf(entry, what);
   const { kind, id } = entry;
   return h("tr", {},
-    h("td", {}, kind === "capture" ? "Photos" : entry.model ? "Model" : "Job"),
+    h("td", {}, what),
     h("td", {}, name),
-    h("td", { "data-label": "Deleted for good" }, ago(entry.deleted_at)),
+    h("td", { "data-label": "Deleted for good" }, when(entry.deleted_at)),
     h("td", {}, h("div", { class: "row" },
       h("button", { class: "small", type: "button", "aria-label": `Restore ${name}`, onclick: async () => {
         await send("DELETE", binned(kind, id));

@@ -2,8 +2,8 @@
 
 import { Problem, get, send } from "../api.js";
 import { putInBin } from "../bin.js";
-import { h } from "../dom.js";
-import { ago, moment, seconds } from "../format.js";
+import { h, when } from "../dom.js";
+import { decibels, nameOf, seconds } from "../format.js";
 import { CANCELLING, FINAL, RUNNING, badgeKind, badgeText } from "../job_states.js";
 import { exampleOffer } from "../example.js";
 import { stageName } from "../job/course.js";
@@ -15,7 +15,7 @@ const REFRESH_MS = 4000; // between two requests for the unfinished jobs, while 
 
 /** @param {any} job */
 function entry(job) {
-  const name = job.name || `Job ${job.id.slice(0, 8)}`;
+  const name = nameOf(job, "Job");
   const done = FINAL.includes(job.state);
   const { progress } = job;
   return h("li", {},
@@ -27,7 +27,7 @@ function entry(job) {
       !done && progress?.total
         ? h("progress", { value: progress.done, max: progress.total, "aria-label": `${name}: ${stageName(progress.stage)}` }) : null,
       tagLinks(job, "/jobs"),
-      h("p", { class: "meta", title: `Created ${moment(job.created_at)}` }, facts(job).join(" · "))),
+      h("p", { class: "meta" }, facts(job).flatMap((fact) => [fact, " · "]), when(job.created_at))),
     h("div", { class: "actions" },
       starButton(`/v1/jobs/${job.id}`, job, (record) => list.update(record)),
       done ? null : h("button", { class: "quiet small", type: "button", "data-focus": "cancel", disabled: job.cancel_requested, onclick: () => cancel(job) }, "Cancel", hidden(name)),
@@ -55,11 +55,10 @@ function facts(job) {
     else if (job.queue_position !== null && job.queue_position !== undefined) sentences.push(job.queue_position === 0 ? "next in the queue" : `${job.queue_position} before it`);
   }
   if (RUNNING.includes(job.state) && progress) {
-    if (progress.psnr) sentences.push(`${progress.psnr.toFixed(1)} dB`);
+    if (progress.psnr) sentences.push(decibels(progress.psnr));
     if (progress.eta) sentences.push(`${stageName(progress.stage)}: about ${seconds(progress.eta)} left`);
   }
   if (job.finished_at && job.started_at) sentences.push(`took ${seconds((Date.parse(job.finished_at) - Date.parse(job.started_at)) / 1000)}`);
-  sentences.push(ago(job.created_at));
   return sentences;
 }
 

@@ -2,6 +2,7 @@
 
 import { get } from "../api.js";
 import { byId, h, toggle } from "../dom.js";
+import { nameOf } from "../format.js";
 
 const TYPING_MS = 250; // a pause in typing after which the list is asked for again
 
@@ -72,7 +73,7 @@ export async function listing({ noun, limit, query, entry, empty, deleteAll, del
 
   /** @param {any} record */
   function checkbox(record) {
-    const check = h("input", { type: "checkbox", "aria-label": `Select ${record.name || record.id.slice(0, 8)}`, disabled: !deletable(record), onchange: () => {
+    const check = h("input", { type: "checkbox", "aria-label": `Select ${nameOf(record, noun === "jobs" ? "Job" : "Model")}`, disabled: !deletable(record), onchange: () => {
       if (check.checked) selected.add(record.id);
       else selected.delete(record.id);
       saySelected();

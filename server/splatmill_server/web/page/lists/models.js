@@ -3,9 +3,9 @@
 import { at } from "../address.js";
 import { get, modelAddress } from "../api.js";
 import { putInBin } from "../bin.js";
-import { append, byId, h } from "../dom.js";
+import { append, byId, h, when } from "../dom.js";
 import { qualityOf } from "../figures.js";
-import { ago, bytes, decibels, moment, number } from "../format.js";
+import { bytes, decibels, nameOf, number } from "../format.js";
 import { exampleOffer } from "../example.js";
 import { starButton, tagLinks } from "../labels.js";
 import { listing } from "./listing.js";
@@ -16,7 +16,7 @@ import { showBin } from "./bin_table.js";
 
 /** @param {any} model */
 function entry(model) {
-  const name = model.name || `Model ${model.id.slice(0, 8)}`;
+  const name = nameOf(model, "Model");
   const picture = pictureOf(model.files);
   return h("li", { class: "tile" },
     picture
@@ -27,7 +27,7 @@ function entry(model) {
       h("p", { class: "figures" }, `${(model.psnr ?? null) === null ? "quality not measured" : `${qualityOf(model.psnr)}, ${decibels(model.psnr)}`} · ${number(model.gaussians)} Gaussians · ${bytes(model.bytes)}`),
       tagLinks(model, "/models"),
       h("div", { class: "foot" },
-        h("span", { title: moment(model.created_at) }, ago(model.created_at)),
+        h("span", {}, when(model.created_at)),
         h("span", { class: "actions push" },
           starButton(modelAddress(model.id), model, (record) => list.update(record)),
           h("button", { class: "quiet small", type: "button", onclick: () => openSharing(modelAddress(model.id), name) }, "Share", h("span", { class: "visually-hidden" }, ` ${name}`)),
@@ -81,8 +81,8 @@ async function storage(inBin) {
       h("tbody", {}, largest.map((/** @type {any} */ record) => h("tr", {},
         h("td", {}, kindOf(record)),
         h("td", {}, place(record)),
-        h("td", { "data-label": "Last used" }, ago(record.last_used)),
-        expire ? h("td", { "data-label": "Deleted" }, record.expires_at ? ago(record.expires_at) : "not by itself") : null,
+        h("td", { "data-label": "Last used" }, when(record.last_used)),
+        expire ? h("td", { "data-label": "Deleted" }, record.expires_at ? when(record.expires_at) : "not by itself") : null,
         h("td", { class: "number" }, bytes(record.bytes)),
         h("td", {}, record.kind === "capture" ? deletePhotos(record) : null))))))]);
   }
@@ -91,7 +91,7 @@ async function storage(inBin) {
 
 /** A button that puts the photos of a capture into the bin. @param {any} record */
 function deletePhotos({ id, name, needed_by: user }) {
-  const text = name || id.slice(0, 8);
+  const text = name || id.slice(0, 8); // after the word "photos"
   return h("button", {
     class: "quiet small", type: "button", disabled: Boolean(user), title: user ? `The job ${user.slice(0, 8)} needs them.` : null, "aria-label": `Delete the photos ${text}`,
     onclick: () => putInBin([{ kind: "capture", id }], "photos", stored, stored),
@@ -106,7 +106,7 @@ function kindOf({ kind, complete }) {
 
 /** The name of a record in storage, which leads to its page; what there is of an unfinished model leads to its job. @param {any} record */
 function place(record) {
-  const name = record.name || record.id.slice(0, 8);
+  const name = nameOf(record, record.kind === "capture" ? "Photos" : record.kind === "model" ? "Model" : "Job");
   if (record.kind === "capture") return name;
   return h("a", { href: `/${record.kind === "model" && record.complete ? "models" : "jobs"}/${record.id}` }, name);
 }

@@ -2,8 +2,8 @@
 
 import { at } from "../address.js";
 import { Problem, get, idOfPage, modelAddress, request } from "../api.js";
-import { byId, h } from "../dom.js";
-import { ago, bytes } from "../format.js";
+import { byId, h, when } from "../dom.js";
+import { ago, bytes, nameOf } from "../format.js";
 import { showCompare } from "./compare.js";
 import { showCameras } from "./cameras.js";
 import { showDownloads } from "./downloads.js";
@@ -54,7 +54,7 @@ async function load(address) {
 async function show(shown) {
   const { model } = shown;
   showName(model);
-  byId("lead").append(...figures(model), ` · ${bytes(model.bytes)} · made ${ago(model.created_at)}`);
+  byId("lead").append(...figures(model), ` · ${bytes(model.bytes)} · made `, when(model.created_at));
   byId("actions").append(...actions(shown));
   void originOf(shown.report).then((origin) => origin && byId("lead").after(origin));
   byId("whole").hidden = false;
@@ -94,7 +94,7 @@ async function lookWhere({ model, address }) {
 
 /** @param {any} model */
 function showName(model) {
-  const name = model.name || `Model ${model.id}`;
+  const name = nameOf(model, "Model");
   document.title = `${name} - Splatmill`;
   byId("title").textContent = name;
   byId("tags").replaceChildren(...[tagLinks(model, "/models")].filter((list) => list !== null));
@@ -104,7 +104,7 @@ function showName(model) {
 function actions({ model, address }) {
   const has = model.files.some((/** @type {any} */ file) => file.name === "report.html");
   return [
-    h("button", { type: "button", onclick: () => openSharing(address, model.name || `Model ${model.id}`) }, "Share"),
+    h("button", { type: "button", onclick: () => openSharing(address, nameOf(model, "Model")) }, "Share"),
     labelButton(address, () => model, (record) => {
       Object.assign(model, { name: record.name, tags: record.tags });
       showName(model);

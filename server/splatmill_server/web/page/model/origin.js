@@ -2,6 +2,7 @@
 
 import { get, modelAddress } from "../api.js";
 import { h } from "../dom.js";
+import { nameOf } from "../format.js";
 
 /**
  * A paragraph about the model that this one was made from, and what was left out; null for a model that was trained.
@@ -19,7 +20,7 @@ export async function originOf(report) {
   ].filter(Boolean);
   const without = parts.length > 1 ? `${parts.slice(0, -1).join(", ")} and ${parts.at(-1)}` : parts[0];
   return h("p", { class: "hint", id: "origin" }, "Made from ",
-    first ? h("a", { href: `/models/${encodeURIComponent(edit.model)}` }, first.name || `Model ${edit.model}`) : "a model that was deleted",
+    first ? h("a", { href: `/models/${encodeURIComponent(edit.model)}` }, nameOf(first, "Model")) : "a model that was deleted",
     ` without ${without}. The training, its photos and its cameras are those of that model.`,
     (edit.box || edit.selection) && " The photos show what was left out, so they do not measure the quality of what is left.");
 }

@@ -1,5 +1,6 @@
 // Files as people give them: dropped files and folders, and those chosen or taken with a camera.
 
+import { day } from "../format.js";
 import { suffix, withoutTop } from "./kinds.js";
 
 /** @typedef {{path: string, file: File, folder?: string}} Given  folder: the one that all were given in, which is not in the path */
@@ -34,13 +35,13 @@ function stripped(files) {
 }
 
 /** What a scene of these files may be called: as their folder, the only file that is no photo by itself, or the day. @param {Given[]} given @param {import("./kinds.js").Accepted} accepted */
-export function nameOf(given, accepted) {
+export function suggestedName(given, accepted) {
   const folder = given[0].folder?.split("/").pop();
   if (folder) return folder;
   const [{ file }] = given;
   const stem = file.name.slice(0, file.name.length - suffix(file.name).length);
   return given.length === 1 && [...accepted.archives, ...accepted.videos].includes(suffix(file.name)) && stem ? stem
-    : new Date(file.lastModified).toLocaleDateString("en", { day: "numeric", month: "long", year: "numeric" });
+    : day(file.lastModified);
 }
 
 /** @param {FileSystemEntry} entry @returns {Promise<Given[]>} */

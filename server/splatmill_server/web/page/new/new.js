@@ -1,13 +1,13 @@
 // The page at `/`: photos in, a job out.
 
 import { Problem, each, get, send } from "../api.js";
-import { byId, h } from "../dom.js";
-import { ago, bytes, count, number } from "../format.js";
+import { byId, h, when } from "../dom.js";
+import { bytes, count, nameOf, number } from "../format.js";
 import { exampleOffer } from "../example.js";
 import { estimateOf } from "./estimate.js";
 import { Gallery } from "./gallery.js";
 import { documentsIn } from "./documents.js";
-import { chosen, dropped, nameOf } from "./given.js";
+import { chosen, dropped, suggestedName } from "./given.js";
 import { Items } from "./items.js";
 import { suffix } from "./kinds.js";
 import { Looking } from "./looking/looking.js";
@@ -140,7 +140,7 @@ async function take(given) {
     notify(`None of these files can be used. ${items.remarks.join(" ") || `Photos are ${kinds} files.`}`, "warning");
   }
   start.adopt();
-  if (added.some(({ role }) => role)) start.suggest(nameOf(given, info.accepted));
+  if (added.some(({ role }) => role)) start.suggest(suggestedName(given, info.accepted));
   redraw();
 }
 
@@ -296,7 +296,7 @@ async function useCapture(id, earlier) {
 function showCapture(capture, deleted = false) {
   const size = capture.files.reduce((/** @type {number} */ sum, /** @type {any} */ file) => sum + file.size, 0);
   byId("place").replaceChildren(h("div", { class: "notice" },
-    h("p", {}, `${capture.name || "Photos without a name"}: ${count(capture.files.length, "file")}, ${bytes(size)}, already on the server.`),
+    h("p", {}, `${nameOf(capture, "Photos")}: ${count(capture.files.length, "file")}, ${bytes(size)}, already on the server.`),
     deleted && h("p", {}, h("strong", {}, "These photos are in the bin. "), "A job on them takes them out of it, and they are kept from then on."),
     h("p", {}, "Choose the settings of another job, or give more photos first. ", h("a", { href: "/" }, "Begin with new photos"))));
   byId("drop-title").textContent = "Drop more photos here";
@@ -328,7 +328,7 @@ async function offerToGoOn() {
   start.offer(upload, capture);
   form.restore(upload.options);
   const box = h("div", { class: "notice", "data-kind": "warning", id: "go-on" },
-    h("p", {}, `An upload was interrupted ${ago(upload.at)}: ${upload.name || "without a name"}, ${number(there)} of ${count(upload.files.length, "file")} arrived.`),
+    h("p", {}, "An upload was interrupted ", when(upload.at), `: ${upload.name || "without a name"}, ${number(there)} of ${count(upload.files.length, "file")} arrived.`),
     h("p", {}, "Choose the same files again; those that are missing are sent. Browsers do not keep files for a page."),
     h("button", { type: "button", class: "small", onclick: () => {
       start.withdraw();
@@ -342,7 +342,7 @@ async function listCaptures() {
   const list = byId("capture-list");
   for await (const capture of each("captures", { limit: LISTED })) {
     if (list.children.length === LISTED) break;
-    list.append(h("li", {}, h("a", { href: `/?capture=${encodeURIComponent(capture.id)}` }, capture.name || "Without a name", h("span", {}, ago(capture.created_at)))));
+    list.append(h("li", {}, h("a", { href: `/?capture=${encodeURIComponent(capture.id)}` }, nameOf(capture, "Photos"), h("span", {}, when(capture.created_at)))));
   }
   const none = list.children.length === 0;
   byId("captures").hidden = none;
