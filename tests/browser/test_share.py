@@ -62,7 +62,9 @@ def test_links_are_made_and_revoked_on_the_page(service: Up, model: SmallModel, 
     ]
     around, hint, address, last = [box for box in boxes if box is not None]
     assert around["y"] <= hint["y"] < hint["y"] + hint["height"] <= address["y"], "it is read before the link"
-    assert last["y"] + last["height"] <= around["y"] + around["height"], "all of it lies in the dialog's window"
+    assert last["y"] + last["height"] <= around["y"] + around["height"], (
+        "all of it lies in the dialog's window"
+    )
     entry = dialog.get_by_role("listitem").filter(has_text="for mum")
     expect(entry).to_contain_text("valid until")
     entry.get_by_role("button", name="Revoke").click()

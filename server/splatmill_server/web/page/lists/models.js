@@ -100,7 +100,7 @@ function deletePhotos({ id, name, needed_by: user }) {
 
 /** What a record in storage is, in words. @param {any} record */
 function kindOf({ kind, complete }) {
-  if (kind === "model" && !complete) return "Unfinished model";
+  if (kind === "model" && complete === false) return "Unfinished model";
   return { capture: "Photos", job: "Checkpoints", model: "Model" }[/** @type {string} */ (kind)] ?? kind;
 }
 
@@ -108,7 +108,7 @@ function kindOf({ kind, complete }) {
 function place(record) {
   const name = nameOf(record, record.kind === "capture" ? "Photos" : record.kind === "model" ? "Model" : "Job");
   if (record.kind === "capture") return name;
-  return h("a", { href: `/${record.kind === "model" && record.complete ? "models" : "jobs"}/${record.id}` }, name);
+  return h("a", { href: `/${record.kind === "model" && record.complete !== false ? "models" : "jobs"}/${record.id}` }, name);
 }
 
 /** @param {{swatch: string, size: number}[]} kinds @param {number} whole */
