@@ -206,7 +206,7 @@ class AsyncClient:
     ) -> AsyncIterator[Capture]:
         """Yield the captures without their files, newest first, at most `limit` of them.
 
-        `name` chooses those whose name contains this text, in any case of letters. `owner` chooses those of one
+        `name` chooses those whose name contains this text, in any case and accent. `owner` chooses those of one
         owner, for callers with the scope admin. Pages are requested as needed.
         """
         return self._entries(
@@ -237,7 +237,7 @@ class AsyncClient:
         """Yield the jobs, at most `limit` of them.
 
         `state` chooses those in this state, or one of several. `name` chooses those whose name contains this text, and
-        `tag` those with this tag, in any case of letters; `favourite` those with a star, or without one; `capture`
+        `tag` those with this tag, in any case and accent; `favourite` those with a star, or without one; `capture`
         those on the capture with this id, and `owner` those of one owner, for callers with the scope admin. `sort` is
         what comes first: newest, name, or the size or psnr of the model; jobs without one come last. Pages are
         requested as needed.
@@ -270,7 +270,7 @@ class AsyncClient:
     ) -> AsyncIterator[Model]:
         """Yield the finished models, at most `limit` of them.
 
-        `name` chooses those whose name contains this text, and `tag` those with this tag, in any case of letters;
+        `name` chooses those whose name contains this text, and `tag` those with this tag, in any case and accent;
         `favourite` those with a star, or without one. `sort` is what comes first: newest, name, size or psnr. `owner`
         chooses those of one owner, for callers with the scope admin. Pages are requested as needed.
         """

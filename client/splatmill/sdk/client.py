@@ -472,7 +472,7 @@ class Client:
     ) -> Iterator[Capture]:
         """Yield the captures without their files, newest first, at most `limit` of them.
 
-        `name` chooses those whose name contains this text, in any case of letters. `owner` chooses those of one
+        `name` chooses those whose name contains this text, in any case and accent. `owner` chooses those of one
         owner, for callers with the scope admin. Pages are requested as needed.
         """
         return self._loop.iterate(self._async.captures(limit=limit, name=name, owner=owner))
@@ -500,7 +500,7 @@ class Client:
         """Yield the jobs, at most `limit` of them.
 
         `state` chooses those in this state, or one of several. `name` chooses those whose name contains this text, and
-        `tag` those with this tag, in any case of letters; `favourite` those with a star, or without one; `capture`
+        `tag` those with this tag, in any case and accent; `favourite` those with a star, or without one; `capture`
         those on the capture with this id, and `owner` those of one owner, for callers with the scope admin. `sort` is
         what comes first: newest, name, or the size or psnr of the model; jobs without one come last. Pages are
         requested as needed.
@@ -534,7 +534,7 @@ class Client:
     ) -> Iterator[Model]:
         """Yield the finished models, at most `limit` of them.
 
-        `name` chooses those whose name contains this text, and `tag` those with this tag, in any case of letters;
+        `name` chooses those whose name contains this text, and `tag` those with this tag, in any case and accent;
         `favourite` those with a star, or without one. `sort` is what comes first: newest, name, size or psnr. `owner`
         chooses those of one owner, for callers with the scope admin. Pages are requested as needed.
         """

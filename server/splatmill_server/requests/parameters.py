@@ -16,13 +16,13 @@ Limit = Annotated[int, Query(ge=1, le=MAX_LIMIT, description="Largest number of 
 NamePart = Annotated[
     str | None,
     Query(
-        max_length=200, description="List only records whose name contains this text, in any case of letters."
+        max_length=200, description="List only records whose name contains this text, in any case and accent."
     ),
 ]
 
 TagOf = Annotated[
     str | None,
-    Query(max_length=40, description="List only records with this tag, in any case of letters."),
+    Query(max_length=40, description="List only records with this tag, in any case and accent."),
 ]
 Favourite = Annotated[
     bool | None, Query(description="List only records with a star, or, if false, only those without one.")

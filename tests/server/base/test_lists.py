@@ -273,3 +273,24 @@ def test_a_capture_that_was_stored_and_not_listed_is_listed_when_its_key_is_repe
     assert service.captures.create(owner="owner3", key="digest of the photos") == (made, False)
     assert captures(service)(None)[0][0] == made.id
     service.captures.delete(made.id)
+
+
+@pytest.mark.parametrize(
+    ("asked", "named"),
+    [
+        ("anna's kit", "Anna\u2019s Kitchen"),
+        ("anna\u2019s", "ANNA'S kitchen"),
+        ("rock 'n'", "Rock \u2018n\u2019 roll"),
+        ("anna\u00b4s", "Anna\u2019s"),
+        ('"big"', "The \u201cBig\u201d one"),
+        ("2024-25", "Winter 2024\u201325"),
+        ("cafe", "Caf\u00e9 Muller"),
+        ("muller", "M\u00fcller"),
+        ("m\u00fcller", "Mu\u0308ller"),
+        ("strasse", "Hauptstra\u00dfe"),
+    ],
+)
+def test_a_name_is_found_as_people_type_it(asked: str, named: str) -> None:
+    assert Filter(name=asked).admits("me", named)
+    assert Filter(tag=named).admits("me", None, [named.upper()])
+    assert not Filter(name=asked).admits("me", named[1:3])

@@ -36,7 +36,7 @@ def jobs(
     ] = None,
     name: Annotated[
         str | None,
-        typer.Option("--name", help="List only jobs whose name contains this text, in any case of letters."),
+        typer.Option("--name", help="List only jobs whose name contains this text, in any case and accent."),
     ] = None,
     capture: Annotated[
         str | None, typer.Option("--capture", metavar="ID", help="List only jobs on this capture.")

@@ -21,13 +21,13 @@ if TYPE_CHECKING:
 Limit = Annotated[int, typer.Option("-n", "--limit", min=1, help="Largest number of records to list.")]
 NamePart = Annotated[
     str | None,
-    typer.Option("--name", help="List only records whose name contains this text, in any case of letters."),
+    typer.Option("--name", help="List only records whose name contains this text, in any case and accent."),
 ]
 
 Tag = Annotated[
     str | None,
     typer.Option(
-        "--tag", help="List only records with this tag, in any case of letters.", show_default=False
+        "--tag", help="List only records with this tag, in any case and accent.", show_default=False
     ),
 ]
 Favourite = Annotated[
