@@ -23,7 +23,7 @@ LEAST_DISSIMILARITY = 1e-4
 BEFORE_TRAINING = ("sfm", "load", "plan")
 """Stages of a job that end before its training begins."""
 
-_MARGINS = {"left": 0.1, "right": 0.9, "top": 0.96, "bottom": 0.11, "hspace": 0.08}
+_MARGINS = {"left": 0.13, "right": 0.9, "top": 0.96, "bottom": 0.11, "hspace": 0.08}
 """Room for the labels, in shares of the figure. matplotlib would find it by drawing everything twice."""
 
 
