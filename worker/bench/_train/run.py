@@ -22,7 +22,7 @@ from _train.outliers import judged
 from _train.perceived import perceived
 from _train.rows import code_version
 from _train.scenes import MADE
-from splatmill.schema import TrainOptions
+from splatmill.schema import Switch, TrainOptions
 from splatmill_worker import pipeline, sfm, synthetic
 from splatmill_worker.__main__ import return_freed_memory
 from splatmill_worker.errors import ModelUnreadable, Refusal, TrainingFailed
@@ -84,11 +84,7 @@ def prepare(job: Row) -> Row:
 def measure(job: Row) -> Row:
     """The row of one run: the capture trained through the pipeline from an empty folder."""
     return_freed_memory()
-    capture, seed = Path(job["capture"]), job["identity"]["seed"]
-    options = TrainOptions.model_validate(job["identity"]["options"] | job["budget"])
-    if posed.find(capture) is not None:
-        # Cameras that are recovered would be recovered again by another seed: there, only training is seeded.
-        options = options.model_copy(update={"seed": seed})
+    capture, seed, options = Path(job["capture"]), job["identity"]["seed"], asked(job)
 
     def revise(plan: Plan) -> Plan:
         return replace(revised(plan, job["identity"]["revised"]), seed=seed)
@@ -178,6 +174,19 @@ def held_out(job: Row, options: TrainOptions, image_size: int) -> tuple[Normaliz
     _, test = split_views(scene, options)
     frame = Normalization.of(scene)
     return frame, [TrainingView.of(photo, frame) for photo in load_views(test, image_size)]
+
+
+def asked(job: Row) -> TrainOptions:
+    """The options of a run: of its scene and its budget, with LPIPS wherever its weights are installed.
+
+    Where cameras are recovered, training alone is seeded, since another seed would recover them again. Evaluation is
+    clocked apart, so that a limited time is no reason to leave LPIPS out.
+    """
+    options = TrainOptions.model_validate(job["identity"]["options"] | job["budget"])
+    wanted: dict[str, Any] = {"lpips": Switch.auto if lpips_weights.absence() else Switch.on}
+    if posed.find(Path(job["capture"])) is not None:
+        wanted["seed"] = job["identity"]["seed"]
+    return options.model_copy(update=wanted)
 
 
 def _perceived(job: Row, options: TrainOptions, gaussians: Gaussians) -> Row:
