@@ -21,6 +21,13 @@ from tests.support.waiting import gone, wait_for
 
 pytestmark = pytest.mark.slow
 
+CAMERA = {
+    "camera_to_world": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -4], [0, 0, 0, 1]],
+    "width": 64,
+    "height": 48,
+    "fov_y_deg": 50,
+}
+
 
 def refused(*options: str, **environment: str) -> str:
     """What `up` says when it ends at its start with status 1."""
@@ -141,6 +148,24 @@ def test_a_redis_of_the_operators_own_is_used(redis_server: RedisServer, own_ser
     job_id = own_service.submit(steps=1)
     assert own_service.ended(job_id)["state"] == "succeeded"
     assert redis_server.connection.exists(f"splatmill:job:{job_id}")
+
+
+def test_the_renderer_is_started_by_the_first_request_to_it_and_requests_wait_for_it(own_service: Up) -> None:
+    def render() -> bytes:
+        answer = own_service.http.post(f"/v1/models/{job_id}/render", json={"camera": CAMERA})
+        assert answer.status_code == 200, answer.text
+        return answer.content
+
+    own_service.start(renders=False)
+    job_id = own_service.submit(steps=1)
+    own_service.ended(job_id)
+    assert not own_service.children("splatmill_worker renderer")
+    first = render()
+    (renderer,) = own_service.children("splatmill_worker renderer")
+    renderer.kill()
+    renderer.wait(10)
+    assert render() == first
+    assert own_service.children("splatmill_worker renderer") != [renderer]
 
 
 def test_a_long_folder_name_still_has_sockets_and_ctrl_c_ends_everything(tmp_path: Path) -> None:

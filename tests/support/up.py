@@ -38,8 +38,12 @@ class Up:
         self.process: subprocess.Popen[str] | None = None
         self.http = httpx.Client(verify=False)  # without TLS no certificates are needed
 
-    def start(self, *options: str, largest_file: int | None = None) -> "Up":
-        """Start and wait until it is ready. `largest_file` (bytes) makes the disk full for anything larger."""
+    def start(self, *options: str, largest_file: int | None = None, renders: bool = True) -> "Up":
+        """Start and wait until it is ready.
+
+        largest_file: bytes; the disk is full for anything larger.
+        renders: whether the renderer is started too, by the first question for it.
+        """
 
         def limit() -> None:
             if largest_file is not None:
@@ -61,8 +65,8 @@ class Up:
         assert line, self.log.read_text()
         self.http.close()
         self.http = httpx.Client(base_url=json.loads(line)["url"], timeout=30, verify=False)
-        # It is started last, and a page that asks for a picture before it listens logs an error.
-        wait_for(lambda: self.http.get("/readyz").json()["checks"]["renderer"] == "ok")
+        if renders:
+            wait_for(lambda: self.http.get("/readyz").json()["checks"]["renderer"] == "ok")
         return self
 
     def stop(self) -> int:
@@ -102,22 +106,20 @@ class Up:
         below: list[psutil.Process] = psutil.Process(self.process.pid).children(recursive=True)
         return below
 
-    def child(self, *words: str) -> int:
-        """The pid of the child whose command line holds all these words."""
+    def children(self, *words: str) -> list[psutil.Process]:
+        """The children whose command lines hold all these words."""
         assert self.process is not None
-        parent = psutil.Process(self.process.pid)
-
-        def find() -> int | None:
-            for child in parent.children():
-                try:
-                    line = " ".join(child.cmdline())
-                except psutil.Error:
-                    continue
+        found = []
+        for child in psutil.Process(self.process.pid).children():
+            with contextlib.suppress(psutil.Error):  # one that has just ended has no command line
+                line = " ".join(child.cmdline())
                 if all(word in line for word in words):
-                    return int(child.pid)
-            return None
+                    found.append(child)
+        return found
 
-        return wait_for(find)
+    def child(self, *words: str) -> int:
+        """The pid of the child whose command line holds all these words, once there is one."""
+        return int(wait_for(lambda: self.children(*words))[0].pid)
 
     @property
     def worker(self) -> int:

@@ -38,6 +38,9 @@ def main(argv: list[str] | None = None) -> int:
     renderer.add_argument("--port", type=int, default=8090)
     renderer.add_argument("--uds", type=Path, help="listen on this unix socket instead of host and port")
     renderer.add_argument(
+        "--fd", type=int, help="listen on the inherited socket with this file descriptor instead"
+    )
+    renderer.add_argument(
         "--backend", choices=["reference", "cpu", "gpu"], help="kernels to render with (default: cpu)"
     )
     for name, what in (("render-file", "an image"), ("orbit-file", "a video")):
@@ -98,7 +101,7 @@ def main(argv: list[str] | None = None) -> int:
         with uncollected():
             from splatmill_worker.render_service.command import serve as serve_renders
 
-        return serve_renders(chosen.host, chosen.port, chosen.uds, chosen.backend)
+        return serve_renders(chosen.host, chosen.port, chosen.uds, chosen.fd, chosen.backend)
     if chosen.program in ("render-file", "orbit-file"):
         with uncollected():
             from splatmill_worker.render_service.local import main as local_main

@@ -39,7 +39,7 @@ def main(argv: list[str] | None = None) -> int:
                 url = (_url(chosen.host, port) if lan is None else lan.url(port)) + root_path
                 if lan is not None:
                     os.environ["SPLATMILL_LAN_URL"] = url
-                supervisor = Supervisor(folder, listener, _print)
+                supervisor = Supervisor(folder, listener, _print, renders_late=chosen.json_ready)
 
                 def ready() -> None:
                     key = os.environ.get("SPLATMILL_API_KEY") or None

@@ -28,7 +28,7 @@ class Child:
     at_death: signal that it receives when the supervisor dies.
     inherited: file descriptors that it inherits.
     deaths: how often it has died.
-    due: monotonic time at which it is to be started; None while it runs.
+    due: monotonic time at which it is to be started; None while it runs, or is not needed yet.
     """
 
     name: str

@@ -3,7 +3,6 @@
 import http.client
 import importlib.util
 import json
-import math
 import os
 import selectors
 import signal
@@ -16,6 +15,7 @@ from contextlib import suppress
 from types import FrameType
 from typing import Any
 
+from splatmill.backplane.private_files import listen
 from splatmill_server.up import redis_server
 from splatmill_server.up.child import Child
 from splatmill_server.up.folder import DataFolder, UpError
@@ -32,12 +32,23 @@ _MAX_DEATHS = 5  # of one child before the service is ready
 
 
 class Supervisor:
-    """The processes of one data folder behind one listening socket. `say` prints messages for the operator.
+    """The processes of one data folder behind one listening socket.
+
+    say: prints messages for the operator.
+    renders_late: whether the renderer is started by the first request to it, and not before. A training by one command
+        mostly needs none.
 
     Raises UpError if the worker or Redis is not installed.
     """
 
-    def __init__(self, folder: DataFolder, listener: socket.socket, say: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        folder: DataFolder,
+        listener: socket.socket,
+        say: Callable[[str], None],
+        *,
+        renders_late: bool = False,
+    ) -> None:
         if importlib.util.find_spec(WORKER) is None:
             raise UpError(
                 "The package splatmill-worker, which trains and renders, is not installed: pip "
@@ -63,9 +74,10 @@ class Supervisor:
         python = sys.executable
         worker = [python, "-m", WORKER, "train", "--stop-grace", str(_STOP_GRACE)]
         self.worker = child("worker", worker, _WORKER_STOP_SECONDS)
-        renderer = [python, "-m", WORKER, "renderer", "--uds", str(folder.renderer_socket)]
         # Started once the API answers: nothing is rendered before, and two cores start three programs more slowly.
-        self.renderer = child("renderer", renderer, 3.0, due=math.inf)
+        self.renderer = child("renderer", [python, "-m", WORKER, "renderer"], 3.0, due=None)
+        self._renders_late = renders_late
+        self._views: socket.socket | None = None
         api = [python, "-m", "splatmill_server.up.api", str(listener.fileno())]
         self.api = child("api", api, 6.0, inherited=(listener.fileno(),))
         self.redis: Child | None = None
@@ -101,7 +113,11 @@ class Supervisor:
                 self._tend()
                 if not announced and self._answers():
                     announced = True
-                    self.renderer.due = time.monotonic()
+                    views = self._listen_for_views()
+                    if self._renders_late:
+                        waiting.register(views, selectors.EVENT_READ)
+                    else:
+                        self.renderer.due = time.monotonic()
                     ready()
                 if not announced:
                     self._check_start(deadline)
@@ -109,12 +125,27 @@ class Supervisor:
                     if key.fileobj is self._wake:
                         with suppress(BlockingIOError):
                             self._wake.recv(4096)
+                    elif key.fileobj is self._views:
+                        waiting.unregister(self._views)
+                        self.renderer.due = time.monotonic()
                     elif not os.read(key.fd, 4096):
                         self._signals += 1  # counts as the first request to stop
                         return
         finally:
             waiting.close()
             self._stop()
+
+    def _listen_for_views(self) -> socket.socket:
+        """Open the socket of the renderer, which each of its processes inherits: requests wait while one starts."""
+        try:
+            self._views = listen(self.folder.renderer_socket, "choose another folder with --data.")
+            self._views.listen(128)
+        except OSError as error:
+            raise UpError(str(error)) from error
+        number = self._views.fileno()
+        self.renderer.command = [*self.renderer.command, "--fd", str(number)]
+        self.renderer.inherited = (number,)
+        return self._views
 
     def _on_signal(self, signum: int, frame: FrameType | None) -> None:
         self._signals += 1
@@ -193,6 +224,9 @@ class Supervisor:
                 began = time.monotonic()
             if not child.wait(child.stop_seconds - (time.monotonic() - began)):
                 self.say(f"The {child.name} did not end within {child.stop_seconds:.0f} s and was killed.")
+        if self._views is not None:
+            self._views.close()
+            self.folder.renderer_socket.unlink(missing_ok=True)
         signal.set_wakeup_fd(-1)
 
 

@@ -1,6 +1,7 @@
 """Starts the renderer: `python -m splatmill_worker renderer`."""
 
 import os
+import socket
 import sys
 from pathlib import Path
 
@@ -17,10 +18,11 @@ MAX_CACHE_BYTES = 1 << 30
 """Largest default for the memory of cached models; machines with little memory use an eighth of it."""
 
 
-def serve(host: str, port: int, uds: Path | None, backend: str | None = None) -> int:
+def serve(host: str, port: int, uds: Path | None, fd: int | None = None, backend: str | None = None) -> int:
     """Serve until a signal to stop. Return the exit status.
 
     host, port: the address to listen on; `uds`, the path of a unix socket, takes its place.
+    fd: the descriptor of a socket that listens already, in place of both.
     backend: the kernels to render with; None means those of the CPU.
 
     SPLATMILL_RENDER_CACHE, a size such as 500MB, limits the memory of cached models.
@@ -29,7 +31,10 @@ def serve(host: str, port: int, uds: Path | None, backend: str | None = None) ->
         log_lines.configure(log_format())
         os.umask(umask())
         app = RenderApp(Storage(storage_url(), read_only=True), _cache_bytes(), backend)
-        listener = listen(uds, "choose another path with --uds.") if uds is not None else None
+        if fd is not None:
+            listener: socket.socket | None = socket.socket(fileno=fd)
+        else:
+            listener = listen(uds, "choose another path with --uds.") if uds is not None else None
     except (StorageError, ValueError, OSError) as error:
         print(error, file=sys.stderr)
         return 1
