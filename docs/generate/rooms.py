@@ -1,5 +1,6 @@
-"""The map of the modules, from their first sentences, and the rooms of ARCHITECTURE.md, from the import contracts."""
+"""The map of the modules, from their sources, and the rooms of ARCHITECTURE.md, from the import contracts."""
 
+import ast
 import re
 import tomllib
 from collections.abc import Iterator, Sequence
@@ -19,7 +20,8 @@ PARTS = {
 
 INTRODUCTION = """# The modules
 
-What each module is for, as its own first sentence says; made by `make docs` from the program.
+What each module is for, as its own first sentence says, and its public functions and classes; made by `make docs` from
+the program.
 [ARCHITECTURE.md](ARCHITECTURE.md) has the rooms on one page, and how they work together. Rooms of server and worker are
 in the order of their floors, from the top; other modules in that of the alphabet.
 """
@@ -81,7 +83,8 @@ def _listed(package: str, folder: Path, depth: int) -> Iterator[str]:
     paths = [path for path in sorted(folder.iterdir()) if _is_module(path)]
     paths.sort(key=lambda path: order.index(path.stem) if path.stem in order else len(order))
     for path in paths:
-        yield f"{'  ' * depth}- {_shown(path)}: {_sentence(path)}"
+        names = _names(path)
+        yield f"{'  ' * depth}- {_shown(path)}: {_sentence(path)}{f' ({choices(names)})' if names else ''}"
         if path.is_dir():
             yield from _listed(f"{package}.{path.stem}", path, depth + 1)
 
@@ -107,6 +110,15 @@ def _sentence(path: Path) -> str:
     if found is None:
         raise ValueError(f"{source} does not begin with a sentence that says what it is for.")
     return re.split(r"(?<=\.) (?=[A-Z`])", " ".join(found[1].split()), maxsplit=1)[0]
+
+
+def _names(path: Path) -> list[str]:
+    """The public functions and classes of a module, in their order; [] of a package."""
+    if path.is_dir():
+        return []
+    kinds = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
+    defined = [node.name for node in ast.parse(path.read_text()).body if isinstance(node, kinds)]
+    return [name for name in dict.fromkeys(defined) if not name.startswith("_")]
 
 
 def _floors(package: str) -> list[list[str]]:

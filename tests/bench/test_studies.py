@@ -25,7 +25,7 @@ STUDIES = [
     *((name, "STUDY") for name in ("kernels", "scale", "sfm", "formats", "mesh", "live")),
     ("kernels", "SIZES"),
     ("sfm", "GROWTH"),
-    *((name, "STUDY") for name in ("abuse", "capacity", "fleet", "fuzz", "load", "openapi")),
+    *((name, "STUDY") for name in ("abuse", "capacity", "fleet", "fuzz", "load", "openapi", "rq_alone")),
 ]
 
 
