@@ -158,7 +158,7 @@ def killed(_: argparse.Namespace) -> Iterator[Row]:
 
 
 def frozen(_: argparse.Namespace) -> Iterator[Row]:
-    """A machine that sleeps until another has its work, and goes on."""
+    """A machine that sleeps until another has its work, and wakes."""
     with trial() as made:
         sleeping = made.worker("any-ann", "any-bob")
         made.enqueue("any-ann", "ann", 40)
@@ -251,7 +251,7 @@ NEEDS = {
     "late_owner": "an owner who comes later is served",
     "taken": "an entry is never lost, with a queue for each owner",
     "taken_of_one": "an entry whose worker dies as it takes it comes back",
-    "killed": "work of a lost machine goes on elsewhere",
+    "killed": "work of a lost machine continues elsewhere",
     "frozen": "nothing runs twice: a machine that slept",
     "clock": "nothing runs twice: clocks that differ",
     "redis_away": "a worker outlives a Redis that is away",
