@@ -3,7 +3,7 @@
 A Gaussian counts as the plane through its centre along which its density is largest on every ray. Under the linearised
 projection that is the mean of its depth at a given pixel: at the centre, the depth changes by Cov(z, pixel)
 Cov(pixel)^-1 per pixel. Its normal is that of the same plane: Sigma^-1 d for the viewing direction
-d (Zhang et al. 2024, RaDe-GS).
+d (Zhang et al. 2024, RaDe-GS). Training has no loss on it (decisions: surface-loss).
 """
 
 from __future__ import annotations
