@@ -37,6 +37,15 @@ class FitImageOptions(Request):
         ),
         json_schema_extra=_BUDGET | {"kind": "duration"},
     )
+    gabor: bool = Field(
+        default=False,
+        description=(
+            "Give half of the Gaussians a wave, a colour that swings over the picture. They are then fewer, with as "
+            "many parameters in all, and show weaves and other textures with less error. Viewers do not draw waves: "
+            "the model is written as model.npz, in place of model.ply and cameras.json."
+        ),
+        json_schema_extra=_BUDGET,
+    )
     image_size: int = Field(
         default=1024,
         ge=16,

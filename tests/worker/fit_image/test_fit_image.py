@@ -24,6 +24,8 @@ from splatmill_worker.fit_image import command as program
 from splatmill_worker.fit_image import plane
 from splatmill_worker.fit_image.command import fit_image
 from splatmill_worker.fit_image.photo import load
+from splatmill_worker.kernels import ops
+from splatmill_worker.kernels.records import Waves
 from splatmill_worker.splat.formats import ply
 from splatmill_worker.splat.plan.budget import Budget
 
@@ -90,6 +92,64 @@ def test_the_scene_is_a_thin_slab_in_an_order_of_its_own(tmp_path: Path) -> None
     assert torch.equal(scene.quats[:, 1:3], torch.zeros(scene.count, 2))
 
 
+def stripes(path: Path) -> Path:
+    """A sinusoid of 0.2 cycles per pixel that leans to one side."""
+    y, x = np.mgrid[0:64, 0:64]
+    swing = np.cos(2 * np.pi * (0.19 * x + 0.06 * y))
+    Image.fromarray((127 + 90 * swing[..., None] * (1.0, 0.6, -0.5)).astype(np.uint8)).save(path)
+    return path
+
+
+def test_waves_show_stripes_with_less_error_at_as_many_parameters(tmp_path: Path) -> None:
+    photo = stripes(tmp_path / "p.png")
+    plain = fit_image(photo, tmp_path / "plain", options(steps=150, gaussians=64))
+    waved = fit_image(photo, tmp_path / "waved", options(steps=150, gaussians=64, gabor=True))
+    assert {path.name for path in waved.files} == {"model.npz", "picture.png", "fit.json", "fit.png"}
+    assert {path.name for path in (tmp_path / "waved").iterdir()} == {path.name for path in waved.files}
+    numbers = json.loads((tmp_path / "waved" / "fit.json").read_text())["result"]
+    assert 9 * numbers["gaussians"] + 6 * numbers["waves"] <= 9 * plain.gaussians
+    assert numbers["waves"] > 0.4 * numbers["gaussians"]
+    assert waved.score.psnr > plain.score.psnr + 6.0
+
+
+def test_the_file_of_waves_has_the_picture_in_it(tmp_path: Path) -> None:
+    """By the formula of the documentation, computed from the arrays alone with the definition in float64."""
+    result = fit_image(stripes(tmp_path / "p.png"), tmp_path, options(steps=80, gaussians=64, gabor=True))
+    arrays = np.load(tmp_path / "model.npz", allow_pickle=False)
+    width, height = arrays["size"].tolist()
+    names = ("means", "log_scales", "quats", "logit_opacities", "sh")
+    means, scales, quats, logits, sh = (torch.from_numpy(arrays[name]).double() for name in names)
+    K = torch.tensor([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]], dtype=torch.float64)
+    viewmat = torch.eye(4, dtype=torch.float64)
+    p = ops.project(
+        means, scales, quats, logits, sh, viewmat, K, width, height, degree=0, backend="reference"
+    )
+    lists = ops.bin(p, width, height, backend="reference")
+    waves = Waves(torch.from_numpy(arrays["waves"]).double(), torch.from_numpy(arrays["wave_rows"]))
+    white = torch.ones(3, dtype=torch.float64)
+    color, _, _ = ops.composite(p, lists, width, height, background=white, waves=waves, backend="reference")
+    with Image.open(tmp_path / "picture.png") as shown:
+        off = np.abs(np.asarray(shown, np.float64) - 255.0 * color.numpy().clip(0, 1))
+    assert off.max() < 1.0
+    assert np.abs(arrays["waves"][:, :2]).max() <= 0.5
+    assert result.gaussians == len(arrays["means"])
+
+
+def test_waves_of_a_transparent_picture_keep_it_transparent(tmp_path: Path) -> None:
+    alpha = np.zeros((HEIGHT, WIDTH, 1), np.uint8)
+    alpha[:, 30:] = 255
+    Image.fromarray(np.concatenate([pixels(), alpha], axis=2)).save(tmp_path / "p.png")
+    assert fit_image(tmp_path / "p.png", tmp_path / "out", options(gabor=True)).score.psnr > 28.0
+    with Image.open(tmp_path / "out" / "picture.png") as shown:
+        assert np.asarray(shown)[:, :26, 3].mean() < 5
+
+
+@pytest.mark.parametrize("steps", [1, 2, 8])
+def test_a_fit_too_short_for_waves_has_none_and_is_whole(tmp_path: Path, steps: int) -> None:
+    result = fit_image(stripes(tmp_path / "p.png"), tmp_path, options(steps=steps, gaussians=1, gabor=True))
+    assert (result.gaussians, len(np.load(tmp_path / "model.npz")["waves"])) == (1, 0)
+
+
 def test_what_is_transparent_stays_so(tmp_path: Path) -> None:
     alpha = np.zeros((HEIGHT, WIDTH, 1), np.uint8)
     alpha[:, 30:] = 255
@@ -108,8 +168,10 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path: Path) -> None:
     written = []
     for name, seed in (("a", 3), ("b", 3), ("c", 4)):
         fit_image(photo, tmp_path / name, options(steps=40, seed=seed))
-        written.append((tmp_path / name / "model.ply").read_bytes())
-    assert written[0] == written[1] != written[2]
+        fit_image(photo, tmp_path / name, options(steps=40, seed=seed, gabor=True))
+        written.append([(tmp_path / name / f"model.{suffix}").read_bytes() for suffix in ("ply", "npz")])
+    assert written[0] == written[1]
+    assert all(a != b for a, b in zip(written[0], written[2], strict=True))
 
 
 def test_a_time_budget_is_spent_and_measured_at_its_end(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import av
 from splatmill.schema import FitImageOptions
 from splatmill_worker.errors import Refusal, TrainingFailed
 from splatmill_worker.fit_image import plane
+from splatmill_worker.fit_image.gabor import FittedWaves, gaussians_for
 from splatmill_worker.fit_image.photo import Say, load
 from splatmill_worker.fit_image.results import Result, write_results
 from splatmill_worker.fit_image.video import TAKEN_AT, FitVideo
@@ -64,7 +65,10 @@ def main(photo: Path, out: Path, options: str) -> int:
 
 
 def fit_image(photo: Path, out: Path, options: FitImageOptions, say: Say = lambda _: None) -> Result:
-    """Fit `photo`, and write model.ply, picture.png, cameras.json, fit.json, fit.png (and fit.mp4) into `out`.
+    """Fit `photo`, and write model.ply, cameras.json, picture.png, fit.json, fit.png (and fit.mp4) into `out`.
+
+    With `options.gabor`, model.npz takes the place of model.ply and cameras.json, and there are fewer Gaussians, so
+    that they have as many parameters in all.
 
     The score of the result is that of the stored model. Raises Refusal for an unusable picture, TrainingFailed for a
     numerical failure, OSError or av.FFmpegError where `out` cannot be written, and InterruptedWhileWriting for Ctrl-C
@@ -73,6 +77,9 @@ def fit_image(photo: Path, out: Path, options: FitImageOptions, say: Say = lambd
     view = load(photo, options.image_size, say)
     camera = view.full.camera
     limit = _gaussians(camera.width * camera.height, options, say)
+    gabor = FittedWaves() if options.gabor else None
+    if gabor is not None:
+        limit = gaussians_for(limit)
     seconds = options.time_budget
     if seconds is None and options.steps is None:
         seconds = DEFAULT_SECONDS
@@ -94,6 +101,7 @@ def fit_image(photo: Path, out: Path, options: FitImageOptions, say: Say = lambd
                 limit,
                 Budget(options.steps, seconds),
                 seed=options.seed,
+                gabor=gabor,
                 evaluated=evaluated,
                 frames_at=() if video is None else TAKEN_AT,
                 frame=lambda color: None if video is None else video.add(color),
@@ -101,7 +109,8 @@ def fit_image(photo: Path, out: Path, options: FitImageOptions, say: Say = lambd
             if video is not None:
                 video.hold()
             writing = True
-            return write_results(out, options, view, fitted, curve)
+            waves = None if gabor is None else gabor.waves
+            return write_results(out, options, view, fitted, curve, waves)
     except KeyboardInterrupt as stop:
         if writing:
             raise InterruptedWhileWriting from stop

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from splatmill_worker.errors import FailureName, TrainingFailed
+from splatmill_worker.fit_image.gabor import FittedWaves, projected_by
 from splatmill_worker.kernels.records import Rates
 from splatmill_worker.scene import Camera
 from splatmill_worker.splat.engine.cpu import CpuEngine
@@ -99,19 +100,21 @@ def fit(
     budget: Budget,
     *,
     seed: int = 0,
+    gabor: FittedWaves | None = None,
     evaluated: Callable[[FitPoint], None] = lambda _: None,
     frames_at: tuple[float, ...] = (),
     frame: Callable[[Tensor], None] = lambda _: None,
 ) -> tuple[Gaussians, list[FitPoint]]:
     """Fit at most `limit` Gaussians to `view`, whose camera is `camera_before`; returns them and the evaluations.
 
+    gabor: fitted along, where given: Gaussians get waves as soon as the picture has its full size.
     evaluated: gets each evaluation.
     frames_at: shares of the budget at which `frame` gets a rendering [H, W, 3].
 
     The picture is fitted over random backgrounds, so that the scene becomes transparent where the photo is, and nowhere
     else. Raises TrainingFailed where the loss is not finite.
     """
-    run = _Fit(view, limit, budget, torch.Generator().manual_seed(seed))
+    run = _Fit(view, limit, budget, torch.Generator().manual_seed(seed), gabor)
     curve: list[FitPoint] = []
     due = list(EVALUATED_AT)
     frames_due = list(frames_at)
@@ -135,13 +138,22 @@ def fit(
 class _Fit:
     """A fit in progress: the Gaussians, their optimiser, the clock and the random numbers."""
 
-    def __init__(self, view: TrainingView, limit: int, budget: Budget, random: torch.Generator) -> None:
-        self.view, self.limit, self.budget, self.random = view, limit, budget, random
+    def __init__(
+        self,
+        view: TrainingView,
+        limit: int,
+        budget: Budget,
+        random: torch.Generator,
+        gabor: FittedWaves | None,
+    ) -> None:
+        self.view, self.limit, self.budget, self.random, self.gabor = view, limit, budget, random, gabor
         full = view.full
         self.pixel = 1.0 / full.camera.fx
         first = max(1, round(FIRST_SHARE * limit))
         self.engine = CpuEngine(self._stacked(self._placed(_detail(full), first)))
         self.engine.keep_scores = False
+        if gabor is not None:
+            gabor.follow(torch.ones(self.engine.count, dtype=torch.bool), 0)
         self.step = 0
         self.growth_due = list(GROWN_AT)
         self.clock = Clock()
@@ -158,6 +170,8 @@ class _Fit:
         self.step += 1
         factor = self._reduction(progress)
         target = self.view.reduced(factor)
+        drawn = None if factor > 1 else self._drawn()
+        self.engine.waves = None if drawn is None else drawn.waves
         # Random also behind an opaque photo: the viewer's own background would show through transparent parts.
         background = torch.rand(3, generator=self.random)
         result = self.engine.train_photo(
@@ -173,6 +187,12 @@ class _Fit:
         )
         if not math.isfinite(result.loss):
             raise TrainingFailed(FailureName.non_finite, f"the loss became {result.loss}.", step=self.step)
+        if drawn is not None and self.engine.wave_gradient is not None:
+            drawn.move(self.engine.wave_gradient, fall_at(progress), self.step)
+
+    def _drawn(self) -> FittedWaves | None:
+        """The waves, once there are some."""
+        return self.gabor if self.gabor is not None and len(self.gabor.waves.values) else None
 
     def evaluate(self) -> tuple[FitPoint, Tensor]:
         """The error against the picture over white, and the rendering [H, W, 3]."""
@@ -183,6 +203,8 @@ class _Fit:
     def _rendered(self) -> tuple[Tensor, Target]:
         target = self.view.full
         camera = target.camera
+        drawn = self._drawn()
+        self.engine.waves = None if drawn is None else drawn.waves
         color, _, _ = self.engine.forward(
             target.viewmat, target.K, camera.width, camera.height, degree=0, background=torch.ones(3)
         )
@@ -199,14 +221,28 @@ class _Fit:
         color, target = self._rendered()
         error = (color - target.over(torch.ones(3)).float() / 255.0).square().sum(dim=2)
         rows = Rows.of(self.engine)
-        rows = rows.keep(torch.sigmoid(rows.gaussians.logit_opacities) > FAINT)
+        kept = torch.sigmoid(rows.gaussians.logit_opacities) > FAINT
+        rows = rows.keep(kept)
         left = self.limit - rows.gaussians.count
         count = left if len(self.growth_due) == 1 else math.ceil(left / len(self.growth_due))
         self.growth_due.pop(0)
         if count > 0:
             rows = rows.grown(self._placed(_blurred(error), count).padded(3))
         stacked = self._stacked(rows.gaussians)
+        self.engine.waves = None
         self.engine.replace(stacked.parameters(), rows.exp_avg, rows.exp_avg_sq)
+        if self.gabor is not None:
+            self.gabor.follow(kept, max(0, count))
+            if self._reduction(self.progress) == 1:
+                self._begin_waves(self.gabor)
+
+    def _begin_waves(self, gabor: FittedWaves) -> None:
+        color, target = self._rendered()
+        residual = target.over(torch.ones(3)).float() / 255.0 - color
+        camera = target.camera
+        parameters = self.engine.parameters()
+        shown = projected_by(parameters, target.viewmat, target.K, camera.width, camera.height)
+        gabor.begin(shown, residual)
 
     def _placed(self, weight: Tensor, count: int) -> Gaussians:
         """`count` new Gaussians at pixels drawn with probability `weight` [H, W], with the colours of the photo.
@@ -259,6 +295,11 @@ class _Fit:
         return Gaussians(means, log_scales, gaussians.quats, gaussians.logit_opacities, gaussians.sh)
 
 
+def fall_at(progress: float) -> float:
+    """What learning rates are multiplied with at `progress`, 0 to 1: half a cosine from 1 to 0.02."""
+    return 0.02 + 0.98 * 0.5 * (1.0 + math.cos(math.pi * progress))
+
+
 def rates_at(progress: float, pixel: float) -> PlaneRates:
     """Learning rates at `progress`, 0 to 1: they fall by half a cosine, positions from 0.3 pixels a step.
 
@@ -266,7 +307,7 @@ def rates_at(progress: float, pixel: float) -> PlaneRates:
 
     The rates are larger than a scene's: every step sees the whole picture, so that its gradient is not noisy.
     """
-    fall = 0.02 + 0.98 * 0.5 * (1.0 + math.cos(math.pi * progress))
+    fall = fall_at(progress)
     return PlaneRates(
         means=fall * 0.3 * pixel,
         log_scales=fall * 6e-2,

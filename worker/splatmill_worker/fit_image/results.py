@@ -15,7 +15,10 @@ from torch import Tensor
 
 from splatmill.files import atomic_write, replacing
 from splatmill.schema import FitImageOptions, ModelCamera, ModelCameras
+from splatmill_worker.fit_image import wave_file
 from splatmill_worker.fit_image.plane import FitPoint
+from splatmill_worker.kernels.records import Waves
+from splatmill_worker.scene import Camera
 from splatmill_worker.splat.evaluate import ViewScore, compare
 from splatmill_worker.splat.formats import ply
 from splatmill_worker.splat.gaussians import Gaussians
@@ -35,8 +38,8 @@ DEGREE = 3
 class Result:
     """What a fit left.
 
-    gaussians: how many model.ply holds.
-    score: error of model.ply, rendered, against the picture.
+    gaussians: how many the model holds.
+    score: error of the stored model, rendered, against the picture.
     files: all files, the video among them where one was asked for.
     """
 
@@ -46,30 +49,53 @@ class Result:
 
 
 def write_results(
-    out: Path, options: FitImageOptions, view: TrainingView, fitted: Gaussians, curve: Sequence[FitPoint]
+    out: Path,
+    options: FitImageOptions,
+    view: TrainingView,
+    fitted: Gaussians,
+    curve: Sequence[FitPoint],
+    waves: Waves | None = None,
 ) -> Result:
-    """Write model.ply, picture.png, cameras.json, fit.json and fit.png into `out`; adds fit.mp4 to the list where
-    `options` ask for it. Raises OSError where a file cannot be written.
+    """Write model.ply, cameras.json, picture.png, fit.json and fit.png into `out`; adds fit.mp4 to the list where
+    `options` ask for it. With `waves`, one model.npz takes the place of the first two.
+
+    Raises OSError where a file cannot be written.
     """
     camera = view.full.camera
-    files = [out / name for name in ("model.ply", "picture.png", "cameras.json", "fit.json", "fit.png")]
+    picture, report, figure = (out / name for name in ("picture.png", "fit.json", "fit.png"))
+    white = torch.ones(3)
+    if waves is None:
+        models = [out / "model.ply", out / "cameras.json"]
+        stored = _write_splats(models[0], fitted, camera)
+        shown = render(stored, camera, background=white)
+        color, alpha = shown.color, shown.alpha
+    else:
+        models = [out / "model.npz"]
+        wave_file.write(models[0], fitted, waves, camera)
+        stored, kept = wave_file.read(models[0])
+        color, alpha = wave_file.rendered(stored, kept, camera, white)
+    score = compare(view.name, color, view.full.over(white))
+    if waves is None:
+        cameras = ModelCameras(cameras=[ModelCamera(name=view.name, camera=spec_of(camera), psnr=score.psnr)])
+        atomic_write(models[1], cameras.model_dump_json(exclude_none=True, indent=1))
+    with replacing(picture) as part:
+        _picture(color, alpha, view.full.alpha is not None).save(part, "PNG")
+    points = [_point(point) for point in curve]
+    numbers = {"gaussians": stored.count} | ({} if waves is None else {"waves": len(waves.values)})
+    atomic_write(report, json.dumps(plain(_report(view.name, options, numbers, score, points)), indent=1))
+    draw_curve(figure, points, {"fit": curve[-1].seconds}, evaluated="the picture")
+    video = [out / "fit.mp4"] if options.video else []
+    return Result(stored.count, score, (*models, picture, report, figure, *video))
+
+
+def _write_splats(path: Path, fitted: Gaussians, camera: Camera) -> Gaussians:
+    """Write model.ply, and return what it holds."""
     comments = (
         "Made by Splatmill",
         f"one picture, seen from the origin along z, {_angle(camera.width, camera.fx)}",
     )
-    ply.write(files[0], fitted, degree=DEGREE, comments=comments)
-    stored = ply.read(files[0]).gaussians
-    shown = render(stored, camera, background=torch.ones(3))
-    score = compare(view.name, shown.color, view.full.over(torch.ones(3)))
-    with replacing(files[1]) as part:
-        _picture(shown.color, shown.alpha, view.full.alpha is not None).save(part, "PNG")
-    cameras = ModelCameras(cameras=[ModelCamera(name=view.name, camera=spec_of(camera), psnr=score.psnr)])
-    atomic_write(files[2], cameras.model_dump_json(exclude_none=True, indent=1))
-    points = [_point(point) for point in curve]
-    report = _report(view.name, options, stored.count, score, points)
-    atomic_write(files[3], json.dumps(plain(report), indent=1))
-    draw_curve(files[4], points, {"fit": curve[-1].seconds}, evaluated="the picture")
-    return Result(stored.count, score, (*files, out / "fit.mp4") if options.video else tuple(files))
+    ply.write(path, fitted, degree=DEGREE, comments=comments)
+    return ply.read(path).gaussians
 
 
 def _picture(color: Tensor, alpha: Tensor, transparent: bool) -> Image.Image:
@@ -92,14 +118,18 @@ def _point(point: FitPoint) -> dict[str, Any]:
 
 
 def _report(
-    name: str, options: FitImageOptions, gaussians: int, score: ViewScore, curve: list[dict[str, Any]]
+    name: str,
+    options: FitImageOptions,
+    numbers: dict[str, int],
+    score: ViewScore,
+    curve: list[dict[str, Any]],
 ) -> dict[str, Any]:
     """What fit.json holds."""
     return {
         "photo": name,
         "options": options.model_dump(mode="json"),
         "curve": curve,
-        "result": {"gaussians": gaussians, "psnr": score.psnr, "ssim": score.ssim, "mse": score.mse},
+        "result": {**numbers, "psnr": score.psnr, "ssim": score.ssim, "mse": score.mse},
         "peak_memory": peak_memory(),
         "versions": versions("cpu"),
         "machine": machine(),

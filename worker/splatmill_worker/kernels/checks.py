@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from .records import Waves
+
 LARGEST_SIDE = 32768
 """Largest width or height of an image in pixels."""
 
@@ -89,3 +91,9 @@ def image_size(width: int, height: int) -> None:
     for name, side in (("width", width), ("height", height)):
         if not 1 <= side <= LARGEST_SIDE:
             raise ValueError(f"{name}: expected 1 to {LARGEST_SIDE} pixels, got {side}")
+
+
+def waves(value: Waves, count: int, *, dtype: torch.dtype = torch.float32, device: str = "cpu") -> None:
+    """Check the waves of `count` Gaussians."""
+    tensor("waves.values", value.values, (None, 6), dtype=dtype, device=device)
+    tensor("waves.rows", value.rows, (count,), dtype=torch.int32, device=device)

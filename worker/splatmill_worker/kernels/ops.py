@@ -14,12 +14,13 @@ import torch
 from torch import Tensor
 
 from . import checks
-from .records import MEDIAN, TILE, Bins, Projected
+from .records import MEDIAN, TILE, Bins, Projected, Waves
 
 __all__ = [
     "Backend",
     "Bins",
     "Projected",
+    "Waves",
     "backend_for",
     "bin",
     "composite",
@@ -104,12 +105,14 @@ def composite(
     height: int,
     *,
     background: Tensor | None = None,
+    waves: Waves | None = None,
     backend: Backend | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Blend front to back into color [H,W,3], alpha [H,W] and depth [H,W] = sum of weight times z, not over alpha.
 
-    background [3]: its colour is weighted by the transmittance left; None is black. Differentiable in the background
-    and in every field of projected but the extents.
+    background [3]: its colour is weighted by the transmittance left; None is black. waves: what varies the colours
+    over the splats; not on gpu. Differentiable in the background, the waves' values and every field of projected but
+    the extents.
     """
     name = _backend(backend, projected.means2d)
     kind = _check_projected(projected, name)
@@ -117,8 +120,16 @@ def composite(
     _check_bins(bins, width, height, kind["device"])
     if background is not None:
         checks.tensor("background", background, (3,), **kind)
+    extra: dict[str, Any] = {}
+    if waves is not None:
+        if name == "gpu":
+            raise NotImplementedError(
+                "composite with waves: the backend gpu does not have it; use cpu or reference."
+            )
+        checks.waves(waves, len(projected.means2d), **kind)
+        extra["waves"] = waves
     image: tuple[Tensor, Tensor, Tensor] = _op(name, "composite")(
-        projected, bins, width, height, background=background
+        projected, bins, width, height, background=background, **extra
     )
     return image
 

@@ -48,6 +48,10 @@ LEAST_BETA2 = 0.95
 the sum is left out."""
 
 
+NYQUIST = 0.5
+"""Largest frequency of a wave in x and in y, cycles per pixel."""
+
+
 MOST_PAIRS = 2**31 - 1
 """(tile, Gaussian) pairs of a view at most: places in its lists are numbered in 31 bits."""
 
@@ -73,6 +77,21 @@ class Projected(NamedTuple):
     colors: Tensor
     depths: Tensor
     extents: Tensor
+
+
+class Waves(NamedTuple):
+    """Waves of Gaussians in the image plane (Gabor functions): a second colour, times a cosine.
+
+    At the offset (dx, dy) from its mean2d, a Gaussian with the wave (fx, fy, phase, amplitude) has the colour
+    `colors + amplitude cos(2 pi (fx dx + fy dy + phase))`, which may be negative. A wave with a value that is not
+    finite, or with |fx| or |fy| above NYQUIST, is not drawn and has no gradient.
+
+    values: [M, 6] fx and fy in cycles per pixel, the phase in turns, the amplitude's red, green and blue.
+    rows: int32 [N] the wave of each Gaussian as a row of values, negative for none; no two share a wave.
+    """
+
+    values: Tensor
+    rows: Tensor
 
 
 class Bins(NamedTuple):

@@ -22,7 +22,7 @@ def _fit_image(
     ] = Path("fit"),
     **options: Any,
 ) -> None:
-    """Fit one picture with Gaussians; write model.ply, picture.png and the error over time to DIR."""
+    """Fit one picture with Gaussians; write the model, picture.png and the error over time to DIR."""
     from pydantic import ValidationError
 
     from splatmill.errors import invalid_request

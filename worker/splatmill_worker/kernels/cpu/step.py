@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from splatmill_worker.kernels import checks
-from splatmill_worker.kernels.records import PARAMETERS, TILE, Rates
+from splatmill_worker.kernels.records import PARAMETERS, TILE, Rates, Waves
 
 from ..morton import morton_order
 from . import blocks, engine
@@ -57,6 +57,9 @@ class Step:
     keep_scores: whether steps add to the densification scores.
     visibility: what the last rendering counted.
     pose_gradient: the camera's gradient of the last update; see `backward_update`.
+    waves: what varies the colours over the Gaussians of later renderings, None for nothing. To be set again after a
+        `replace`.
+    wave_gradient: the loss's gradient [M, 6] to the values of the waves of the last `train` or `backward_update`.
     blocks, exp_avg, exp_avg_sq: parameters and moments, float32 [ceil(N/16), 59, 16] (`blocks`); with `clustered`, in
         an order of their own, and without the steps missed.
     """
@@ -89,6 +92,9 @@ class Step:
         self._degree = 0
         self.visibility = Visibility(0, 0)
         self.pose_gradient: Tensor | None = None
+        self.waves: Waves | None = None
+        self.wave_gradient: Tensor | None = None
+        self._waved: int | None = None  # waves of the last rendering
         self.replace(
             {
                 "means": means,
@@ -303,6 +309,8 @@ class Step:
     ) -> None:
         checks.camera(viewmat, K, width, height, degree, near, background)
         self._rendered = False  # until it is: an error leaves the frame's lists half made
+        if self.waves is not None:
+            checks.waves(self.waves, self.count)
         shape = (planes, -(-height // TILE) * TILE, -(-width // TILE) * TILE)
         if self._image.shape != shape:
             self._image, self._gradient = torch.zeros(shape), torch.zeros(shape)
@@ -320,7 +328,9 @@ class Step:
             self._image,
             self.threads,
             self._clusters,
+            *(() if self.waves is None else (x.detach().contiguous() for x in self.waves)),
         )
+        self._waved = None if self.waves is None else len(self.waves.values)
         self.visibility = Visibility(*seen)
         self._degree, self._size, self._rendered = degree, (height, width), True
 
@@ -346,6 +356,7 @@ class Step:
         if step < 1:
             raise ValueError(f"step: counts from 1, got {step}")
         self.pose_gradient = torch.empty(6) if pose_gradient else None
+        self.wave_gradient = None if self._waved is None else torch.zeros(self._waved, 6)
         refused: int = engine.update(
             self._frame,
             self.blocks,
@@ -361,6 +372,7 @@ class Step:
             self.threads,
             self.pose_gradient,
             self._clusters,
+            self.wave_gradient,
         )
         self._rendered = False  # the rendering shows the Gaussians before they moved
         return refused

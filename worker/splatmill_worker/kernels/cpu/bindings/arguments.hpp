@@ -14,6 +14,7 @@ using Row = Tensor<float, nb::shape<-1>>;
 template <int N>
 using Rows = Tensor<float, nb::shape<-1, N>>;
 using Matrix4 = Tensor<float, nb::shape<4, 4>>;
+using WaveRows = Tensor<int32_t, nb::ndim<1>>;  // the wave of each Gaussian, below 0 for none
 using Image = Tensor<float, nb::ndim<3>>;  // [3 or 5, rows, stride], both padded to whole tiles
 
 inline Planes planes_of(const Image& image, const Camera& cam) {

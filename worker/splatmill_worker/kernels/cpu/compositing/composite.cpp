@@ -6,6 +6,7 @@
 #include <string>
 
 #include "bindings/rows.hpp"
+#include "compositing/waves.hpp"
 #include "simd/threads.hpp"
 #include "tiles/reach.hpp"
 
@@ -131,7 +132,8 @@ void bind_composite(nb::module_& m) {
       "composite",
       [](Frame& frame, Rows<2> means2d, Rows<3> conics, Row opacities, Rows<3> colors, Row depths, Rows<2> extents,
          Tensor<int64_t, nb::ndim<1>> offsets, Tensor<int32_t, nb::ndim<1>> ids, int width, int height,
-         const std::tuple<float, float, float>& background, Image image, int threads) {
+         const std::tuple<float, float, float>& background, Image image, int threads, std::optional<Rows<kWaveFloats>> waves,
+         std::optional<WaveRows> wave_rows) {
         const ProjectedRows rows{means2d.data(), conics.data(), opacities.data(), colors.data(), depths.data(), extents.data()};
         const float rgb[3] = {std::get<0>(background), std::get<1>(background), std::get<2>(background)};
         nb::gil_scoped_release release;
@@ -139,25 +141,31 @@ void bind_composite(nb::module_& m) {
         frame.camera.width = width, frame.camera.height = height;
         take_lists(frame, rows, static_cast<int64_t>(depths.shape(0)), offsets.data(), ids.data(),
                    static_cast<int64_t>(ids.shape(0)), threads);
+        frame.with_waves = waves && wave_rows;
+        if (frame.with_waves)
+          take_waves(frame, waves->data(), static_cast<int64_t>(waves->shape(0)), wave_rows->data(), frame.count);
         composite_forward(frame, planes_of(image, frame.camera), true, rgb, threads);
       },
       "frame"_a, "means2d"_a.noconvert(), "conics"_a.noconvert(), "opacities"_a.noconvert(), "colors"_a.noconvert(),
       "depths"_a.noconvert(), "extents"_a.noconvert(), "offsets"_a.noconvert(), "ids"_a.noconvert(), "width"_a, "height"_a,
-      "background"_a, "image"_a.noconvert(), "threads"_a,
+      "background"_a, "image"_a.noconvert(), "threads"_a, "waves"_a.noconvert().none() = nb::none(),
+      "wave_rows"_a.noconvert().none() = nb::none(),
       "Blends the lists into five planes (colour, alpha, depth) and leaves in the frame what the backward pass needs.");
   m.def(
       "composite_backward",
       [](Frame& frame, Image image, Image gradient, Rows<2> d_means2d, Rows<3> d_conics, Row d_opacities, Rows<3> d_colors,
-         Row d_depths, int threads) {
+         Row d_depths, int threads, std::optional<Rows<kWaveFloats>> d_waves) {
         const ProjectedRows out{d_means2d.data(), d_conics.data(), d_opacities.data(), d_colors.data(), d_depths.data(), nullptr};
         const ImageGradient g{planes_of(image, frame.camera), planes_of(gradient, frame.camera), true};
         nb::gil_scoped_release release;
         assign_slots(frame);
         composite_backward(frame, g, threads);
         gradients_of_rows(frame, out, threads);
+        if (d_waves) gradients_of_waves(frame, nullptr, d_waves->data(), threads);
       },
       "frame"_a, "image"_a.noconvert(), "gradient"_a.noconvert(), "d_means2d"_a.noconvert(), "d_conics"_a.noconvert(),
       "d_opacities"_a.noconvert(), "d_colors"_a.noconvert(), "d_depths"_a.noconvert(), "threads"_a,
+      "d_waves"_a.noconvert().none() = nb::none(),
       "Writes the gradients of the Gaussians that were blended; other rows keep what they hold, so pass zeros.");
   m.def(
       "count_blocks",

@@ -7,7 +7,8 @@ namespace splatmill {
 // The planes after the three of colour.
 inline constexpr int kAlphaPlane = 3, kDepthPlane = 4;
 
-// Blends frame.entries front to back into `image`: three planes of colour, or five with alpha and depth. For the backward pass it
+// Blends frame.entries front to back into `image`: three planes of colour, or five with alpha and depth. With frame.with_waves,
+// colours have their waves. For the backward pass it
 // writes final_T and walked, and reduces the blocks of every entry to those that it changed.
 void composite_forward(Frame& frame, const Planes& image, bool with_alpha_and_depth, const float background[3], int threads);
 
@@ -23,8 +24,13 @@ enum PairSum {
   kSumQ = 0, kSumQU, kSumQV, kSumQUU, kSumQUV, kSumQVV,
   kSumRed, kSumGreen, kSumBlue,  // w dL/dcolour
   kSumDepth,                     // w dL/ddepth; last, because a pass without depth stops before it
-  kSums
+  kSums,
+  // Of Gaussians with a wave:
+  kSumFrequencyX = kSums, kSumFrequencyY, kSumPhase,  // over 2 pi
+  kSumWaveRed, kSumWaveGreen, kSumWaveBlue,
+  kWaveSums
 };
+static_assert(kWaveSums == kPairSums && kWaveSums - kSums == kWaveFloats);
 
 // Writes the pair_sums of every pair that the forward pass blended, and clears `blocks` of every other touch.
 void composite_backward(Frame& frame, const ImageGradient& gradient, int threads);

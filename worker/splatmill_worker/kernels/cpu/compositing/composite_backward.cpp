@@ -6,6 +6,7 @@
 // a Gaussian are added later in a fixed order. There are no atomics, and results do not depend on the number of threads.
 #include "compositing/blend.hpp"
 #include "compositing/composite.hpp"
+#include "compositing/waves.hpp"
 #include "simd/shuffles.hpp"
 #include "simd/threads.hpp"
 
@@ -44,9 +45,18 @@ SPLATMILL_INLINE void load_block_gradient(const Frame& frame, const ImageGradien
   store(block.final_T, final_T);
 }
 
-template <bool kDepth>
+// The wave moves with its Gaussian: what the phase gains by a move of the centre is added to the sums that the centre's gradient is
+// made of, (2 ln 2 ux QU, 2 ln 2 (uy QU + vy QV)).
+SPLATMILL_INLINE void move_with_gaussian(const Record& r, const Wave& wave, float* sums) {
+  const double scale = 6.283185307179586 / (2.0 * 0.6931471805599453) * sums[kSumPhase];
+  const double along_u = -wave.fx * scale / r.ux;
+  sums[kSumQU] += static_cast<float>(along_u);
+  sums[kSumQV] += static_cast<float>((-wave.fy * scale - r.uy * along_u) / r.vy);
+}
+
+template <bool kDepth, bool kWaves>
 void differentiate_tile(Frame& frame, const ImageGradient& g, int tile) {
-  constexpr int kCount = kDepth ? kSums : kSumDepth;
+  constexpr int kCount = kWaves ? kWaveSums : kDepth ? kSums : kSumDepth;
   const int columns = frame.camera.columns(), tile_x = tile % columns, tile_y = tile / columns;
   const float x0 = tile_x * kTile + 0.5f, y0 = tile_y * kTile + 0.5f;
   const TileLanes lanes = tile_lanes();
@@ -69,6 +79,8 @@ void differentiate_tile(Frame& frame, const ImageGradient& g, int tile) {
     const TileForm form(r, lanes, x0, y0);
     const Float level = splat(r.level);
     const Float red = splat(r.color[0]), green = splat(r.color[1]), blue = splat(r.color[2]);
+    const Wave* wave = kWaves ? frame.wave_of(entry.id) : nullptr;
+    const WaveForm over(wave ? *wave : Wave{}, r, lanes, x0, y0);
     Float s[kCount];
     for (int i = 0; i < kCount; ++i) s[i] = splat(0.0f);
     const auto add_blocks = [&](auto may_clamp) __attribute__((always_inline)) {
@@ -86,6 +98,20 @@ void differentiate_tile(Frame& frame, const ImageGradient& g, int tile) {
         const Float d_red = load(block.d_red), d_green = load(block.d_green), d_blue = load(block.d_blue);
         Float along = fma(blue, d_blue, fma(green, d_green, red * d_red));  // colour . gradient
         if constexpr (kDepth) along = fma(splat(r.depth), load(block.d_depth), along);
+        if constexpr (kWaves) {
+          if (wave) {
+            const Float turns = over.turns_at(b), cosine = cos_turns(turns), swing = w * cosine;
+            const Float d_cosine = fma(wave->amplitude[2], d_blue, fma(wave->amplitude[1], d_green, wave->amplitude[0] * d_red));
+            along = fma(d_cosine, cosine, along);
+            const Float slope = -(w * d_cosine * sin_turns(turns));  // dL/dphase, over 2 pi
+            s[kSumPhase] += slope;
+            s[kSumFrequencyX] = fma(slope, lanes.pixel_x + (over.dx + b % kBlocksAcross * kBlockSide), s[kSumFrequencyX]);
+            s[kSumFrequencyY] = fma(slope, lanes.pixel_y + (over.dy + b / kBlocksAcross * kBlockSide), s[kSumFrequencyY]);
+            s[kSumWaveRed] = fma(swing, d_red, s[kSumWaveRed]);
+            s[kSumWaveGreen] = fma(swing, d_green, s[kSumWaveGreen]);
+            s[kSumWaveBlue] = fma(swing, d_blue, s[kSumWaveBlue]);
+          }
+        }
         const Float gain = w * along;
         const Float behind = load(block.behind) - gain;
         store(block.behind, behind);
@@ -110,6 +136,8 @@ void differentiate_tile(Frame& frame, const ImageGradient& g, int tile) {
       add_blocks(std::false_type{});
     float* sums = frame.pair_sums.get() + static_cast<int64_t>(entry.slot) * kPairSums;
     store_lane_sums<kCount>(sums, s);
+    if constexpr (kWaves)
+      if (wave) move_with_gaussian(r, *wave, sums);
   }
   for (; k < end; ++k) frame.touches[frame.entries[k].slot].blocks = 0;
 }
@@ -124,10 +152,14 @@ void composite_backward(Frame& frame, const ImageGradient& g, int threads) {
     const FlushDenormals flush;
 #pragma omp for schedule(dynamic, 2)
     for (int tile = 0; tile < tiles; ++tile) {
-      if (g.with_alpha_and_depth)
-        differentiate_tile<true>(frame, g, tile);
+      if (frame.with_waves && g.with_alpha_and_depth)
+        differentiate_tile<true, true>(frame, g, tile);
+      else if (frame.with_waves)
+        differentiate_tile<false, true>(frame, g, tile);
+      else if (g.with_alpha_and_depth)
+        differentiate_tile<true, false>(frame, g, tile);
       else
-        differentiate_tile<false>(frame, g, tile);
+        differentiate_tile<false, false>(frame, g, tile);
     }
   }
 }

@@ -1,6 +1,7 @@
 // composite, forward: the list of each tile front to back, sixteen pixels to a register, only the blocks that an ellipse reaches.
 #include "compositing/blend.hpp"
 #include "compositing/composite.hpp"
+#include "compositing/waves.hpp"
 #include "simd/threads.hpp"
 
 namespace splatmill {
@@ -25,7 +26,7 @@ SPLATMILL_INLINE uint32_t still_live(const Block<kDepth>* blocks, uint32_t live)
   return live;
 }
 
-template <bool kDepth>
+template <bool kDepth, bool kWaves>
 void blend_tile(Frame& frame, const Planes& image, const float background[3], int tile) {
   const Camera& cam = frame.camera;
   const int columns = cam.columns(), tile_x = tile % columns, tile_y = tile / columns;
@@ -55,6 +56,8 @@ void blend_tile(Frame& frame, const Planes& image, const float background[3], in
     const TileForm form(r, lanes, x0, y0);
     const Float level = splat(r.level);
     const Float red = splat(r.color[0]), green = splat(r.color[1]), blue = splat(r.color[2]);
+    const Wave* wave = kWaves ? frame.wave_of(entry.id) : nullptr;
+    const WaveForm over(wave ? *wave : Wave{}, r, lanes, x0, y0);
     uint32_t changed = 0;
     for (uint32_t left = entry.blocks & live; left; left &= left - 1) {
       const int b = __builtin_ctz(left);
@@ -68,6 +71,14 @@ void blend_tile(Frame& frame, const Planes& image, const float background[3], in
       store(block.red, fma(w, red, load(block.red)));
       store(block.green, fma(w, green, load(block.green)));
       store(block.blue, fma(w, blue, load(block.blue)));
+      if constexpr (kWaves) {
+        if (wave) {
+          const Float swing = w * cos_turns(over.turns_at(b));
+          store(block.red, fma(swing, splat(wave->amplitude[0]), load(block.red)));
+          store(block.green, fma(swing, splat(wave->amplitude[1]), load(block.green)));
+          store(block.blue, fma(swing, splat(wave->amplitude[2]), load(block.blue)));
+        }
+      }
       if constexpr (kDepth) store(block.depth, fma(w, splat(r.depth), load(block.depth)));
       changed |= static_cast<uint32_t>(any(blended)) << b;
       store(block.T, mark(hit & ~blended, select(blended, T_after, T)));
@@ -101,10 +112,14 @@ void composite_forward(Frame& frame, const Planes& image, bool with_alpha_and_de
     const FlushDenormals flush;
 #pragma omp for schedule(dynamic, 2)
     for (int tile = 0; tile < tiles; ++tile) {
-      if (with_alpha_and_depth)
-        blend_tile<true>(frame, image, background, tile);
+      if (frame.with_waves && with_alpha_and_depth)
+        blend_tile<true, true>(frame, image, background, tile);
+      else if (frame.with_waves)
+        blend_tile<false, true>(frame, image, background, tile);
+      else if (with_alpha_and_depth)
+        blend_tile<true, false>(frame, image, background, tile);
       else
-        blend_tile<false>(frame, image, background, tile);
+        blend_tile<false, false>(frame, image, background, tile);
     }
   }
 }

@@ -29,6 +29,14 @@ struct Span {
   uint32_t first, count;
 };
 
+// What is added to the colour of a Gaussian at an offset d from its centre: amplitude times cos(2 pi (fx dx + fy dy + phase)).
+struct Wave {
+  float fx, fy;  // cycles per pixel
+  float phase;   // turns
+  float amplitude[3];
+};
+inline constexpr int kWaveFloats = 6;
+
 inline constexpr int kPairSums = 16;  // floats per pair
 
 // Wall seconds of the last passes, for benchmarks.
@@ -57,8 +65,12 @@ struct Frame {
   Buffer<float> final_T;         // [tiles][16 blocks][16 pixels]
   Buffer<int32_t> walked;        // [tiles] entries of the list that the forward pass looked at
   Buffer<float> pair_sums;       // [slots][kPairSums]
+  bool with_waves = false;       // whether the next two are of this view
+  Buffer<Wave> waves;
+  Buffer<int32_t> wave_rows;     // [count] the wave of each Gaussian, below 0 for none
   Buffer<double> pose_sums;      // [chunks of the update][kPoseSums], used when the camera's gradient is asked for
 
+  const Wave* wave_of(uint32_t id) const { return wave_rows[id] < 0 ? nullptr : &waves[wave_rows[id]]; }
   int tiles() const { return camera.columns() * camera.rows(); }
 };
 

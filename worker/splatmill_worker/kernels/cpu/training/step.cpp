@@ -3,6 +3,7 @@
 // a Gaussian's gradient never leaves the first-level cache.
 #include "bindings/arguments.hpp"
 #include "compositing/composite.hpp"
+#include "compositing/waves.hpp"
 #include "projection/geometry.hpp"
 #include "projection/pose.hpp"
 #include "projection/project.hpp"
@@ -178,7 +179,8 @@ void bind_step(nb::module_& m) {
   m.def(
       "render",
       [](Frame& frame, Blocks params, int64_t count, int degree, const Camera& camera,
-         const std::tuple<float, float, float>& background, Image image, int threads, const Clusters* clusters) {
+         const std::tuple<float, float, float>& background, Image image, int threads, const Clusters* clusters,
+         std::optional<Rows<kWaveFloats>> waves, std::optional<WaveRows> wave_rows) {
         const float rgb[3] = {std::get<0>(background), std::get<1>(background), std::get<2>(background)};
         const bool with_alpha_and_depth = image.shape(0) == 5;
         nb::gil_scoped_release release;
@@ -188,19 +190,22 @@ void bind_step(nb::module_& m) {
         frame.seconds.project = watch.lap();
         bin_frame(frame, threads);
         frame.seconds.bin = watch.lap();
+        frame.with_waves = waves && wave_rows;
+        if (frame.with_waves)
+          take_waves(frame, waves->data(), static_cast<int64_t>(waves->shape(0)), wave_rows->data(), count);
         composite_forward(frame, planes_of(image, camera), with_alpha_and_depth, rgb, threads);
         frame.seconds.forward = watch.lap();
         return std::make_tuple(frame.visible_count, frame.pairs);
       },
       "frame"_a, "params"_a.noconvert(), "count"_a, "degree"_a, "camera"_a, "background"_a, "image"_a.noconvert(), "threads"_a,
-      "clusters"_a.none() = nb::none(),
+      "clusters"_a.none() = nb::none(), "waves"_a.noconvert().none() = nb::none(), "wave_rows"_a.noconvert().none() = nb::none(),
       "Renders blocks of parameters into three planes of colour or, with alpha and depth, five planes; returns the numbers of "
       "visible Gaussians and of (tile, Gaussian) pairs. With `clusters`, the others than those chosen last are taken to be out of view.");
   m.def(
       "update",
       [](Frame& frame, Blocks params, Blocks exp_avg, Blocks exp_avg_sq, int degree, Image image, Image gradient,
          const std::vector<float>& rates, double beta2, int64_t step, std::optional<ScoreRows> scores, int threads,
-         std::optional<Twist> pose, Clusters* clusters) {
+         std::optional<Twist> pose, Clusters* clusters, std::optional<Rows<kWaveFloats>> d_waves) {
         Update update;
         update.state = {params.data(), exp_avg.data(), exp_avg_sq.data()};
         update.adam = AdamStep(step, beta2);
@@ -211,6 +216,7 @@ void bind_step(nb::module_& m) {
         nb::gil_scoped_release release;
         Stopwatch watch;
         composite_backward(frame, g, threads);
+        if (d_waves) gradients_of_waves(frame, frame.visible.get(), d_waves->data(), threads);
         frame.seconds.backward = watch.lap();
         const Scene scene{params.data(), degree};
         if (clusters) {
@@ -232,6 +238,7 @@ void bind_step(nb::module_& m) {
       "frame"_a, "params"_a.noconvert(), "exp_avg"_a.noconvert(), "exp_avg_sq"_a.noconvert(), "degree"_a,
       "image"_a.noconvert(), "gradient"_a.noconvert(), "rates"_a, "beta2"_a, "step"_a,
       "scores"_a.noconvert().none(), "threads"_a, "pose"_a.noconvert().none() = nb::none(), "clusters"_a.none() = nb::none(),
+      "d_waves"_a.noconvert().none() = nb::none(),
       "Backward pass of the last render and one Adam step; returns how many gradient values were refused as not finite. Adds to "
       "`scores` [3, Gaussians] and fills `pose` [6] with the gradient to a motion of the camera (pose.hpp), where given. With "
       "`clusters`, which `render` was given too, moves those chosen last.");
