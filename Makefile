@@ -78,8 +78,8 @@ walk: $(VENV)/.installed-dev ## walk the pages as a new user, at three sizes and
 pictures: $(VENV)/.installed ## make the documentation's pictures of what photos do to a model (some minutes)
 	$(BIN)/python docs/pictures.py
 
-bench: install ## error against run time: kernels, scale, functions, stability, worst inputs, stiffness, SfM, training, formats, meshes (long)
-	for name in kernels scale functions stability worst stiffness sfm train live formats mesh; do $(BIN)/splatmill bench $$name || exit 1; done
+bench: install ## error against run time: kernels, scale, functions, stability, worst inputs, stiffness, SfM, training, formats, meshes, waves (long)
+	for name in kernels scale functions stability worst stiffness sfm train live formats mesh gabor; do $(BIN)/splatmill bench $$name || exit 1; done
 
 soak: $(VENV)/.installed-dev ## faults at random moments against the whole service (STORAGE=s3, SOAK_ARGS="--faults 30"; some 40 minutes)
 	$(BIN)/splatmill bench soak --storage $(or $(STORAGE),folder) $(SOAK_ARGS)

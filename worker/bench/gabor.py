@@ -238,10 +238,10 @@ STUDY = Study(
         "photos": {"nargs": "*", "type": Path, "default": []},
         "pixels": {"nargs": "+", "type": int, "default": [16, 64], "help": "pixels for each plain Gaussian"},
         "side": {"type": int, "default": 96},
-        "steps": {"type": int, "default": 300},
+        "steps": {"type": int, "default": 800},
         "views": {"type": int, "default": 30, "help": "of the scene, every 5th held out"},
-        "gaussians": {"nargs": "+", "type": int, "default": [150, 600], "help": "plain ones of the scene"},
-        "scene-steps": {"type": int, "default": 800},
+        "gaussians": {"nargs": "+", "type": int, "default": [200, 600], "help": "plain ones of the scene"},
+        "scene-steps": {"type": int, "default": 1000},
         "seed": {"type": int, "default": 0},
     },
 )

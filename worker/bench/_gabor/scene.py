@@ -29,6 +29,11 @@ PLAIN, WAVE = 14, 7
 SIDE, SAMPLES, FOCAL = 96, 3, 110.0
 """Pixels of the views both ways, samples of a pixel both ways, focal length in pixels."""
 
+UNIT = 30.0
+"""Unit of the frequencies that Adam moves, cycles per world unit: its rate is then that of phases and amplitudes."""
+
+WAVE_RATE = 2e-2
+
 BEGUN_AT = (0.15, 0.3, 0.45)
 """Shares of the steps at which Gaussians get waves."""
 
@@ -148,7 +153,7 @@ class _Model:
             "quats": torch.randn(count, 4, generator=random),
             "logit_opacities": torch.full((count,), 0.5),
             "sh": torch.zeros(count, 1, 3),
-            "waves": torch.zeros(count, WAVE),  # frequency 3, phase in turns, amplitude 3
+            "waves": torch.zeros(count, WAVE),  # frequency 3 in UNIT, phase in turns, amplitude 3
         }
         self.rows = torch.full((count,), -1, dtype=torch.int32)
         for value in self.groups.values():
@@ -161,7 +166,7 @@ class _Model:
             "sh": 1e-2 / SH_C0,
         }
         own = [{"params": [self.groups[name]], "lr": rate, "rate": rate} for name, rate in rates.items()]
-        own.append({"params": [self.groups["waves"]], "lr": 1e-2, "rate": 1e-2})
+        own.append({"params": [self.groups["waves"]], "lr": WAVE_RATE, "rate": WAVE_RATE})
         self.adam = torch.optim.Adam(own, eps=1e-15)
 
     def project(self, viewmat: Tensor, K: Tensor) -> Projected:
@@ -176,7 +181,7 @@ class _Model:
             given = torch.nonzero(self.rows >= 0).squeeze(1)
             values = self.groups["waves"][given]
             frequency = torch.einsum(
-                "nij,nj->ni", self.carried(projected.conics[given], given, viewmat), values[:, :3]
+                "nij,nj->ni", self.carried(projected.conics[given], given, viewmat), UNIT * values[:, :3]
             )
             number = torch.full_like(self.rows, -1)
             number[given] = torch.arange(len(given), dtype=torch.int32)
@@ -215,7 +220,7 @@ class _Model:
             world = torch.einsum("nij,nj->ni", torch.linalg.pinv(carried), values[:, :2])
             good = world.isfinite().all(1) & (values[:, :2].abs().amax(1) < NYQUIST)
             largest[better[good]], most[better[good]] = size[better[good]], energy[good]
-            found[better[good]] = torch.cat([world, values[:, 2:]], 1)[good]
+            found[better[good]] = torch.cat([world / UNIT, values[:, 2:]], 1)[good]
         most[self.rows >= 0] = -1.0
         wanted = int(gabor.SHARE * count) - int((self.rows >= 0).sum())
         if wanted <= 0:

@@ -35,8 +35,8 @@ GAIN = 0.5
 CHUNK = 2048
 """Gaussians whose spectra are computed together: 100 MB."""
 
-FREQUENCY_RATE, PHASE_RATE, AMPLITUDE_RATE = 3e-3, 1e-2, 1.1e-2
-"""Adam's learning rates at the start of a fit: cycles per pixel, turns, colour."""
+FREQUENCY_RATE, PHASE_RATE, AMPLITUDE_RATE = 1e-2, 3e-2, 3e-2
+"""Adam's learning rates at the start of a fit: cycles per pixel, turns, colour (decisions: gabor-share)."""
 
 
 def gaussians_for(limit: int) -> int:
