@@ -5,9 +5,10 @@
     splatmill bench gabor --only pictures --pictures --photos photos/a.jpg photos/b.jpg
 
 Every picture is fitted by plain Gaussians and by ones of which half have a wave, 9 parameters a Gaussian and 6 a wave,
-in as many steps, and once more by plain ones in the CPU seconds that the waves took. A photo is cropped to a square in
-its middle, and is no part of the figure. Seconds are CPU seconds of one thread, with the thirteen evaluations of a fit. `--only scene` trains a scene
-in 3D, a woven floor and a striped ball, with waves and without.
+in as many steps, and once more by plain ones in the CPU seconds that the waves took. Of a photo, the square in its
+middle is reduced to the size of the pictures; photos are no part of the figure. Seconds are CPU seconds of one thread,
+with the thirteen evaluations of a fit. `--only scene` trains a scene in 3D, a woven floor and a striped ball, with waves
+and without.
 
 Expected before it was measured: several dB where one frequency repeats (stripes, knit, weave), nothing on smooth
 colours, and a loss of some tenths on text, whose edges need places rather than frequencies; twice the time of a step.
@@ -55,9 +56,10 @@ def measured(options: argparse.Namespace) -> Iterator[Row | str]:
     for path in options.photos:
         try:
             with Image.open(path) as photo:
-                side = min(options.side, *photo.size)
+                side = min(photo.size)
                 left, top = (photo.width - side) // 2, (photo.height - side) // 2
-                pixels = np.asarray(photo.convert("RGB").crop((left, top, left + side, top + side)))
+                square = photo.convert("RGB").crop((left, top, left + side, top + side))
+                pixels = np.asarray(square.resize((options.side, options.side), Image.Resampling.LANCZOS))
         except OSError as error:
             yield f"{path} is left out: {error}."
             continue
