@@ -128,7 +128,7 @@ def test_values_and_gradients_are_the_definitions(backend: str, count: int, wide
         # A phase has four roundings of up to a turn's 2 pi and the cosine's own 2.5e-7; alphas and sums some EPS for
         # each of up to 100 splats at a pixel. Gradients add up to 1500 pixels with weights near one.
         scale = float(b.abs().max()) + 1e-3
-        at_most(name, f"waves {count}", (a.double() - b).abs(), 1000 * EPS * scale)
+        at_most(name, f"waves {count}", (a.double() - b).abs(), 400 * EPS * scale)
 
 
 @pytest.mark.parametrize("backend", BUILDS)
@@ -280,11 +280,11 @@ def test_the_fused_step_has_the_gradient_of_the_definition(backend: str) -> None
         step = Step(means, scales, quats, logits, sh)
         step.waves = Waves(waves.values.detach().float(), waves.rows)
         color, _, _ = step.forward(viewmat, K, WIDTH, HEIGHT, degree=0)
-        at_most("color", "waves, step", (color.double() - want.detach()).abs(), 2e-5)
+        at_most("color", "waves, step", (color.double() - want.detach()).abs(), 4e-6)
         got = step.gradients(weight)
         for name, gradient in zip(leaves, gradients, strict=False):
             scale = float(gradient.abs().max()) + 1e-6
-            at_most(name, "waves, step", (got[name].double() - gradient).abs(), 2e-4 * scale)
+            at_most(name, "waves, step", (got[name].double() - gradient).abs(), 100 * EPS * scale)
         step.forward(viewmat, K, WIDTH, HEIGHT, degree=0)
         step.backward_update(weight, rates=Rates(0, 0, 0, 0, 0, 0), step=1)
     assert step.wave_gradient is not None
@@ -292,6 +292,6 @@ def test_the_fused_step_has_the_gradient_of_the_definition(backend: str) -> None
         "waves",
         "waves, step",
         (step.wave_gradient.double() - gradients[-1]).abs(),
-        2e-4 * float(gradients[-1].abs().max()),
+        100 * EPS * float(gradients[-1].abs().max()),
     )
     assert (step.wave_gradient[waves.rows[6]] == 0).all()

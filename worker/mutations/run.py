@@ -56,6 +56,7 @@ PROOFS = {
     "cpu/knn": ["test_knn.py"],
     "cpu/correlate": ["test_correlate.py"],
     "cpu/median_depth": ["test_median_depth.py"],
+    "cpu/waves": ["test_waves.py"],
     "cpu/pose": ["test_cpu_pose.py"],
     "cpu/step": ["test_cpu_step.py", *GRADIENTS],
     "cpu/threads": ["test_cpu_isa.py", "test_proof_poison.py"],
@@ -107,7 +108,8 @@ FUNCTIONS = "test_functions.py"
 ALL = [
     "test_proof_backward.py", "test_proof_forward.py", "test_proof_step.py", "test_cpu_step.py", "test_cpu_pose.py",
     "test_cpu_clusters.py", "test_adam.py", "test_loss.py", "test_knn.py", "test_correlate.py", "test_proof_poison.py",
-    "test_cpu_input.py", "test_reference_order.py", "test_reference_gsplat.py", "test_cpu_isa.py", FUNCTIONS,
+    "test_cpu_input.py", "test_reference_order.py", "test_reference_gsplat.py", "test_cpu_isa.py", "test_waves.py",
+    FUNCTIONS,
 ]  # fmt: skip
 ALL_GPU = [
     "test_gpu_step.py", "test_gpu_ops.py", "test_gpu_waiting.py", "test_gpu_records.py", "test_gpu_launches.py",

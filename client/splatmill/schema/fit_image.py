@@ -41,8 +41,8 @@ class FitImageOptions(Request):
         default=False,
         description=(
             "Give half of the Gaussians a wave, a colour that swings over the picture. They are then fewer, with as "
-            "many parameters in all, and show weaves and other textures with less error. Viewers do not draw waves: "
-            "the model is written as model.npz, in place of model.ply and cameras.json."
+            "many parameters in all, and show weaves and other repeated textures with less error; photos gain little. "
+            "Viewers do not draw waves: the model is written as model.npz, in place of model.ply and cameras.json."
         ),
         json_schema_extra=_BUDGET,
     )

@@ -1,5 +1,7 @@
 """A small scene of repeated textures in 3D, trained from its true cameras with waves and without.
 
+Waves pay in equal steps and not in equal time (decisions: gabor-3d).
+
 In 3D a wave is a plane wave of frequency f (cycles per world unit) through the centre of its Gaussian. Where a ray
 meets the Gaussian, the expected place is mu + Sigma M^T C d, with d the offset in the image, C the conic and M = J W.
 The wave in the image then has the frequency C M Sigma f, which is what is drawn. Its fading across thick

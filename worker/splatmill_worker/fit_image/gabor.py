@@ -30,7 +30,7 @@ SHORTEST = 0.2
 """Least cycles of a new wave over a standard deviation of its Gaussian: less is hardly more than another colour."""
 
 GAIN = 0.5
-"""Amplitude of a new wave over that which fits the residual alone: neighbours answer to the same residual."""
+"""Amplitude of a new wave, as a share of what fits the residual: neighbours answer to the same residual."""
 
 CHUNK = 2048
 """Gaussians whose spectra are computed together: 100 MB."""
