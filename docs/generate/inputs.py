@@ -26,6 +26,7 @@ from splatmill_worker.images.lens import PANORAMA, PINHOLE_MODELS
 from splatmill_worker.images.no_photo import TRAITS
 from splatmill_worker.images.overlays import overlay
 from splatmill_worker.images.panoramas import faces, panoramas
+from splatmill_worker.pipeline import scan_fit
 from splatmill_worker.readers import scan
 from splatmill_worker.readers.colmap_files import MODELS
 from splatmill_worker.readers.programs.shots import MAX_LENGTH_ERROR
@@ -292,9 +293,24 @@ def _points() -> list[str]:
         """`--start scan.laz` names a file of points that are used beside all these. It may be a `.ply` or one of the
         formats below, of which all but text need `pip install 'splatmill-worker[scans]'`:""",
         table(["suffix", "format"], [[code(suffix), name] for suffix, name in POINT_FORMATS.items()]),
-        f"""Its coordinates must be those of the cameras, which therefore have to come with the photos; offsets such as
-        those of UTM are kept in float64. Of more than {scan.MOST:,} points, evenly chosen ones are read. The photos
-        judge the points as above, and the job is refused where they do not fit, with the share that does.""",
+        f"""If cameras came with the photos, the points may be in their coordinates, and the photos judge them
+        as above. If not, or if they do not fit so, points with colours are aligned by a similarity to the
+        points of the photos: any scale, turn and offset, also where the scan has only a part of the scene,
+        or much more. Offsets such as those of UTM are kept in float64. The report has the matrix, the
+        scale, the share of the points of the photos that lie on the scan, and their median distance from it
+        in units of the file (`given_points_alignment`). An aligned scan is used if the photos show its
+        colours at least {scan_fit.LEAST_SHARE:.0%} as often, above chance, as those of the scene's own
+        points. Otherwise the job is refused with these numbers, as it is for a mirrored scan, which no
+        similarity turns right. Points without colours are not aligned; in the coordinates of given cameras,
+        they get the median colour of the photos that see them, if photos agree on these more than by
+        chance.
+
+        The coordinates of an `.e57` are metres by its standard. If the cameras were recovered and neither
+        GPS nor `scale` gives a unit, the model is then in metres. Those of other formats may be anything.
+
+        Of more than {scan.MOST:,} points, evenly chosen ones are read. Of these, one stays for each pixel
+        of the photo that shows its place closest, and at most {points.MOST_LOOSE:,} are used; the log has
+        the numbers.""",
     ]
 
 

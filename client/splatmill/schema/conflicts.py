@@ -42,10 +42,6 @@ def _is_model(start: str | None) -> bool:
     )
 
 
-def _is_points(start: str | None) -> bool:
-    return start is not None and is_point_file(start)
-
-
 CONFLICTS = (
     Conflict(
         ("pose_refinement", "backend"),
@@ -66,12 +62,6 @@ CONFLICTS = (
         ("gaps", "start"),
         lambda gaps, start: gaps == "on" and _is_model(start),
         "Gaps between points are filled, and start names a model: set gaps to auto, or leave start out.",
-    ),
-    Conflict(
-        ("scale", "start"),
-        lambda scale, start: scale is not None and _is_points(start),
-        "Points to start from need cameras that came with the photos, and these are never scaled: leave out scale or "
-        "start.",
     ),
 )
 """All pairs of training options that exclude each other."""

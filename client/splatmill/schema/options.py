@@ -222,8 +222,8 @@ class TrainOptions(Request):
         description=(
             "Model to start from, in place of the points of the reconstruction: the id of a model on the server, or "
             "a model file (.ply, .spz, ...). Or a file of points to start from beside these (.las, .laz, .e57, .pcd, "
-            ".xyz, .pts, .ply). A file is given by its path or by its name among the capture's poses. Coordinates "
-            "must be those of the capture's cameras; points need cameras that came with the photos."
+            ".xyz, .pts, .ply). A file is given by its path or by its name among the capture's poses. A model "
+            "must be in the coordinates of the capture's cameras; points with colours may be in any."
         ),
         json_schema_extra=_PHOTOS,
     )

@@ -1,4 +1,4 @@
-"""Proves that a training starts from the points of a scan where they fit the cameras, and is refused where they do not.
+"""Proves that a training starts from the points of a scan where the photos show them, and is refused where they do not.
 
 The scan is simulated on the still life: true surfaces with the noise of a scanner's ranges. Does not prove that a
 training gains from it.
@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from splatmill.schema import TrainOptions
 from splatmill_worker.errors import Refusal
@@ -57,7 +58,10 @@ def test_points_of_a_scan_come_beside_those_of_the_photos(name: str, capture: Pa
     near = np.abs(scene.points[-used:, None] - points[None]).max(axis=2).min(axis=1)
     assert near.max() < 1e-3
     assert len(scene.points) > used + 50  # a scan has holes, so that the data set's own points stay
-    assert f"{name} holds {len(points):,} points, of which {used:,} are used" in scene.notes[-1]
+    assert f"{name} holds {len(points):,} points. One for each pixel" in scene.notes[-1]
+    assert f"of which {used:,} are used" in scene.notes[-1]
+    assert used <= scene.facts["given_points_resolved"] <= len(points)
+    assert "given_points_alignment" not in scene.facts
     assert start_model_path(capture, tmp_path, TrainOptions(start=name)) is None
 
 
@@ -71,23 +75,60 @@ def test_a_scan_beside_a_zip_of_photos_and_cameras(capture: Path, tmp_path: Path
 
 
 @pytest.mark.parametrize("change", ["axes", "units"])
-def test_points_elsewhere_are_refused_with_the_share(change: str, capture: Path, tmp_path: Path) -> None:
+def test_points_elsewhere_are_aligned(change: str, capture: Path, tmp_path: Path) -> None:
     points, colors = scanned()
-    points = np.array(OFFSET) + (
-        (points - np.array(OFFSET))[:, [1, 2, 0]] if change == "axes" else 1000 * (points - np.array(OFFSET))
-    )
+    local = points - np.array(OFFSET)
+    scale = 1000.0 if change == "units" else 1.0
+    points = np.array(OFFSET) + scale * (local[:, [1, 2, 0]] if change == "axes" else local)
     write_ply(capture / "poses" / "scan.ply", points, colors)
+    own = with_own_points(capture)
+    scene = load(capture, tmp_path, "scan.ply")
+    alignment = scene.facts["given_points_alignment"]
+    assert alignment["scale"] == pytest.approx(1.0 / scale, rel=0.01)
+    assert alignment["share"] > 0.9
+    used = scene.facts["given_points_used"]
+    assert used > 0.7 * len(points)
+    off = np.linalg.norm(scene.points[-used:, None] - own[None, ::3], axis=2).min(axis=1)
+    assert np.median(off) < 0.1
+    assert "scan.ply was aligned to the photos" in scene.notes[-1]
+    assert scene.frame is None  # given cameras are never moved
+
+
+def with_own_points(capture: Path) -> np.ndarray:
+    """The points that the data set gets of its own, all over the scene."""
+    random = np.random.default_rng(2)
+    life = still_life.scene()
+    points: np.ndarray = life.points + np.array(OFFSET) + random.normal(0, 0.002, life.points.shape)
+    poses = json.loads((capture / "poses" / "transforms.json").read_text())
+    (capture / "poses" / "transforms.json").write_text(json.dumps({**poses, "ply_file_path": "own.ply"}))
+    write_ply(capture / "poses" / "own.ply", points, life.colors)
+    return points
+
+
+def test_a_scan_of_another_place_is_refused_with_the_share(capture: Path, tmp_path: Path) -> None:
+    with_own_points(capture)
+    random = np.random.default_rng(0)
+    walls = random.uniform(-2, 2, (3000, 3))
+    walls[:1500, 0], walls[1500:, 1] = 2.0, 1.0
+    colors = np.random.default_rng(1).integers(0, 255, walls.shape).astype(np.uint8)
+    write_ply(capture / "poses" / "scan.ply", walls, colors)
     with pytest.raises(Refusal) as refused:
         load(capture, tmp_path, "scan.ply")
     assert refused.value.code == "start_unusable"
-    assert "do not fit the cameras" in refused.value.message
-    assert "%" in refused.value.message
+    assert (
+        "The points of scan.ply do not fit the photos. As they lie: No photo shows any"
+        in refused.value.message
+    )
+    assert "% of the points of the photos lie on them" in refused.value.message
+    assert "exchanged colours at" in refused.value.message
 
 
-def test_points_need_cameras(capture: Path, tmp_path: Path) -> None:
-    write_ply(capture / "poses" / "scan.ply", *scanned())
-    (capture / "poses" / "transforms.json").unlink()
-    with pytest.raises(Refusal, match=r"scan\.ply holds points, and no cameras came with the photos"):
+def test_cameras_without_points_of_their_own_align_nothing(capture: Path, tmp_path: Path) -> None:
+    points, colors = scanned()
+    write_ply(capture / "poses" / "scan.ply", points * 1000.0, colors)
+    for photo in (capture / "images").iterdir():
+        Image.new("RGB", (still_life.WIDTH, still_life.HEIGHT), (90, 90, 90)).save(photo)
+    with pytest.raises(Refusal, match="of the cloud of the photos, it has 0 distinct points"):
         load(capture, tmp_path, "scan.ply")
 
 

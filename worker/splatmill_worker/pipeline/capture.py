@@ -42,7 +42,7 @@ def posed_scene(
         only file in images/ may be a zip of a whole data set, or ask for the example.
     workdir: folder where structure from motion, triangulation and stereo store their results, and from which they
         read earlier ones.
-    options: only those of structure from motion are read.
+    options: those of structure from motion are read, and those of the points to start from.
     on_progress: called with the progress of structure from motion, triangulation and stereo.
     cancelled: polled; when it returns true, Cancelled is raised.
     observer: looks at the cameras and points while structure from motion places them.
@@ -86,15 +86,8 @@ def posed_scene(
             scene, workdir, seed=options.seed, on_progress=on_progress, cancelled=cancelled
         )
         if points is not None:
-            scene = given_points.with_given_points(scene, points, cancelled)
+            scene = given_points.with_given_points(scene, points, options, cancelled)
         return replace(scene, warnings=(*scene.warnings, *one_place.warning(scene)))
-    if points is not None:
-        raise Refusal(
-            "start_unusable",
-            f"{points.name} holds points, and no cameras came with the photos: cameras that are recovered from photos "
-            "have a coordinate system of their own, in which the points do not lie.",
-            advice="Give the cameras in the coordinates of the points too, or leave out the option start.",
-        )
     images = capture / "images"
     wanted = sfm.SfmOptions(
         effort=options.sfm_effort.value,
@@ -114,6 +107,8 @@ def posed_scene(
         observer,
         None if options.scale is None else known_distance(options.scale),
     )
+    if points is not None:
+        scene = given_points.with_given_points(scene, points, options, cancelled)
     unread = [*posed.without_cameras(capture), *zipped.unused_cameras(capture, workdir, cancelled)]
     return replace(
         scene, warnings=(*names_remark(capture), *unread, *scene.warnings, *one_place.warning(scene))

@@ -1,9 +1,10 @@
-"""Points that a training starts from, of a file of a laser scanner or a depth camera, in the world of given cameras."""
+"""Points that a training starts from, of a file of a laser scanner or a depth camera, where the photos show them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,11 @@ from splatmill.schema import TrainOptions
 from splatmill.schema.files.formats import is_point_file
 from splatmill_worker.errors import Refusal
 from splatmill_worker.images.decoding import decoders
+from splatmill_worker.pipeline import scan_fit
 from splatmill_worker.readers import scan
-from splatmill_worker.scene import Scene
-from splatmill_worker.sfm import posed
+from splatmill_worker.scene import PointViews, Scene
+from splatmill_worker.sfm.alignment import LIBRARY
+from splatmill_worker.sfm.world.frame import in_metres
 from splatmill_worker.wording import plain
 
 HEADER_BYTES = 65_536
@@ -58,20 +61,99 @@ def points_path(capture: Path, options: TrainOptions) -> Path | None:
     return path if end and not any(name in header for name in GAUSSIANS) else None
 
 
-def with_given_points(scene: Scene, path: Path, cancelled: Callable[[], bool]) -> Scene:
+def with_given_points(
+    scene: Scene, path: Path, options: TrainOptions, cancelled: Callable[[], bool]
+) -> Scene:
     """The scene with those points of a file that its photos show, beside its own: a scan has holes, and no sky.
 
-    The result has no tracks, since those of its own points alone would mean that no photo shows the others.
+    Where the cameras were given, the points may lie in their coordinates. Otherwise they are aligned to the points of
+    the scene. A scene of an arbitrary unit is then in metres, if those of the file are.
 
     Raises Refusal for a file that cannot be read or has no points, for a format whose library is not installed, and
-    where the photos show none of the points; and Cancelled.
+    where the photos do not show the points; and Cancelled.
     """
     if (module := scan.lacking(path)) is not None:
-        raise Refusal(
-            "start_unusable",
-            f"{path.name} cannot be read on this worker: the Python module {module} is not installed.",
-            advice="Install it with pip install 'splatmill-worker[scans]', or give the points as .ply or .xyz.",
+        raise _lacking(path.name, module, "cannot be read", ", or give the points as .ply or .xyz")
+    points, colors, count = _read(path)
+    fit = None
+    if scene.source != "sfm":
+        fit = scan_fit.as_it_lies(scene, points, colors, options.image_size, cancelled)
+    if fit is None or not fit.fits:
+        if find_spec(LIBRARY) is None:
+            raise _lacking(path.name, LIBRARY, "cannot be aligned to the photos", "")
+        where = "" if fit is None else f"As they lie: {fit.sentence} "
+        fit = scan_fit.aligned(scene, points, colors, options.image_size, options.seed, cancelled)
+        if not fit.fits:
+            raise Refusal(
+                "start_unusable",
+                f"The points of {path.name} do not fit the photos. {where}{fit.sentence}",
+                advice="Give a scan with colours of what the photos show, or points in the coordinates of "
+                "given cameras; or leave out the option start.",
+            )
+    facts: dict[str, Any] = {
+        "given_points": count,
+        "given_points_resolved": fit.resolved,
+        "given_points_used": len(fit.points),
+        "sparse_points": scene.facts.get("sparse_points", len(scene.points)),
+    }
+    notes = [
+        f"{path.name} holds {count:,} points. One for each pixel of the closest photo leaves {fit.resolved:,}, of "
+        f"which {len(fit.points):,} are used: photos show their colours."
+    ]
+    if fit.alignment is not None:
+        facts["given_points_alignment"] = asdict(fit.alignment)
+        notes.append(
+            f"{path.name} was aligned to the photos: {fit.sentence} One of its units is {fit.alignment.scale:.4g} of "
+            "the model."
         )
+    scene = replace(
+        scene,
+        points=np.concatenate([scene.points, fit.points]),
+        colors=np.concatenate([scene.colors, fit.colors]),
+        **_tracks(scene, fit),
+        notes=(*scene.notes, *notes),
+        facts=scene.facts | facts,
+    )
+    return _in_metres(scene, path, fit.alignment)
+
+
+def _tracks(scene: Scene, fit: scan_fit.Fit) -> dict[str, Any]:
+    """The tracks of the scene's points and of those of the scan after them; none where the scene's are not known, since
+    those of the scan alone would mean that no photo shows the others."""
+    if scene.point_views is None:
+        return {"point_views": None, "point_errors": None, "track_lengths": None}
+    added = scan_fit.point_views(scene, fit.points)
+    offsets, views = scene.point_views
+    offsets = np.concatenate([offsets, offsets[-1] + added.offsets[1:]])
+    errors = scene.point_errors
+    return {
+        "point_views": PointViews(offsets, np.concatenate([views, added.views])),
+        "point_errors": None if errors is None else np.append(errors, np.full(len(fit.points), np.nan)),
+        "track_lengths": np.diff(offsets).astype(np.int32),
+    }
+
+
+def _in_metres(scene: Scene, path: Path, alignment: scan_fit.Alignment | None) -> Scene:
+    """The scene with the metre as its unit, where that was arbitrary and the file's is the metre by its standard."""
+    if scene.frame is None or alignment is None or scene.frame.unit != "arbitrary":
+        return scene
+    if path.suffix.lower() not in scan.IN_METRES:
+        return scene
+    before = scene.frame.reasons.get("unit")
+    reason = f"Metres, because those of {path.name} are."
+    resized = in_metres(scene, 1.0 / alignment.scale, reason)
+    matrix = np.array(alignment.matrix)
+    matrix[:3] /= alignment.scale
+    told = asdict(replace(alignment, scale=1.0, matrix=matrix.tolist()))
+    return replace(
+        resized,
+        notes=tuple(reason if note == before else note for note in resized.notes),
+        facts=resized.facts | {"given_points_alignment": told},
+    )
+
+
+def _read(path: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8], int]:
+    """Finite points and colours of a file, one or more, and their number in the file. Raises Refusal, and Cancelled."""
     try:
         points, colors, count = decoders.call_once(scan.read, path, check=_points, fault=_fault)
     except OSError as error:
@@ -80,25 +162,14 @@ def with_given_points(scene: Scene, path: Path, cancelled: Callable[[], bool]) -
         raise _unusable(f"The points in {path.name} cannot be read: {plain(error)}.") from error
     if not len(points):
         raise _unusable(f"{path.name} holds no point with finite coordinates.")
-    judged = posed.with_loose_points(
-        replace(scene, points=points, colors=colors, point_views=None, point_errors=None, notes=()), cancelled
-    )
-    if not len(judged.points):
-        raise Refusal(
-            "start_unusable",
-            f"The points of {path.name} do not fit the cameras. {' '.join(judged.notes)}",
-            advice="Give points and cameras of one coordinate system, such as those that one program has exported "
-            "together, or leave out the option start.",
-        )
-    note = f"{path.name} holds {count:,} points, of which {len(judged.points):,} are used: photos show their colours."
-    return replace(
-        scene,
-        points=np.concatenate([scene.points, judged.points]),
-        colors=np.concatenate([scene.colors, judged.colors]),
-        point_views=None,
-        point_errors=None,
-        notes=(*scene.notes, note),
-        facts=scene.facts | {"given_points": count, "given_points_used": len(judged.points)},
+    return points, colors, count
+
+
+def _lacking(name: str, module: str, what: str, otherwise: str) -> Refusal:
+    return Refusal(
+        "start_unusable",
+        f"{name} {what} on this worker: the Python module {module} is not installed.",
+        advice=f"Install it with pip install 'splatmill-worker[scans]'{otherwise}.",
     )
 
 

@@ -29,6 +29,9 @@ CHUNK = 1_000_000
 LIBRARIES = {".las": ("laspy",), ".laz": ("laspy", "lazrs"), ".e57": ("pye57",), ".pcd": ("pypcd4",)}
 """The modules that read a format, by its suffix."""
 
+IN_METRES = (".e57",)
+"""Formats whose coordinates are metres by their standard (ASTM E2807); those of the others may be anything."""
+
 POINT_BYTES = 200
 """Bytes that a point takes at the peak of reading in formats that are read whole."""
 

@@ -52,23 +52,32 @@ def in_frame(scene: Scene, frame: ModelFrame, known: KnownDistance | None) -> Sc
 
     Raises Refusal when the distance is between photos without a camera, or at one place.
     """
-    similarity = Similarity.of(np.array(frame.from_sfm, np.float64))
-    moved = similarity.apply(scene)
+    moved = Similarity.of(np.array(frame.from_sfm, np.float64)).apply(scene)
     if known is not None:
         scale = scale_by(moved, known)
-        resized = Similarity(np.eye(3), scale, np.zeros(3))
-        moved, similarity = resized.apply(moved), similarity.then(resized)
         unit = f"Metres, because {known.first} and {known.second} were taken {known.metres:g} m apart."
         if frame.unit == "metre":
             unit += f" By GPS it would be {known.metres / scale:.3g} m."
-        frame = frame.model_copy(
-            update={
-                "unit": "metre",
-                "from_sfm": similarity.matrix.tolist(),
-                "reasons": frame.reasons | {"unit": unit},
-            }
-        )
+        moved = in_metres(replace(moved, frame=frame), scale, unit)
+        assert moved.frame is not None
+        frame = moved.frame
     return replace(moved, frame=frame, notes=(*scene.notes, *frame.reasons.values()))
+
+
+def in_metres(scene: Scene, scale: float, reason: str) -> Scene:
+    """A scene with a frame, `scale` times as large, with the metre as its unit, and the sentence that says why."""
+    assert scene.frame is not None
+    resized = Similarity(np.eye(3), scale, np.zeros(3))
+    frame = scene.frame.model_copy(
+        update={
+            "unit": "metre",
+            "from_sfm": Similarity.of(np.array(scene.frame.from_sfm, np.float64))
+            .then(resized)
+            .matrix.tolist(),
+            "reasons": scene.frame.reasons | {"unit": reason},
+        }
+    )
+    return replace(resized.apply(scene), frame=frame)
 
 
 def scale_by(scene: Scene, known: KnownDistance) -> float:

@@ -78,7 +78,7 @@ def evidence_of(
     total = np.zeros((count, 3))
     transparent = 0
     others = colors[np.random.default_rng(0).permutation(count)]
-    for photo in _photos(views, cancelled):
+    for photo in photos(views, cancelled):
         seen = photo.camera.project(points)
         rows = np.flatnonzero(seen.inside)
         row, column = seen.rows[rows].astype(np.int64), seen.columns[rows].astype(np.int64)
@@ -104,7 +104,7 @@ def evidence_of(
     return Evidence(shown, agreeing, by_chance, through, mean.round().astype(np.uint8), transparent)
 
 
-def _photos(views: Sequence[View], cancelled: Callable[[], bool]) -> Iterator[Photo]:
+def photos(views: Sequence[View], cancelled: Callable[[], bool]) -> Iterator[Photo]:
     """The photos at the size of the comparison, a few at a time. Raises Cancelled between two photos."""
     with ThreadPoolExecutor(min(LOADERS, os.cpu_count() or 1)) as pool:
         for start in range(0, len(views), LOADERS):

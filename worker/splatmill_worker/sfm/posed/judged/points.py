@@ -26,6 +26,7 @@ from splatmill_worker.sfm.options import LEAN, STANDARD
 from splatmill_worker.sfm.posed.judged import conventions, orientation
 from splatmill_worker.sfm.posed.judged.evidence import Evidence, evidence_of
 from splatmill_worker.sfm.posed.judged.triangulation import Triangulated, contradicted, triangulate
+from splatmill_worker.sfm.posed.judged.uncolored import seen_in
 
 VERSION = 2
 """Version of the method; points stored under another version are searched for anew."""
@@ -95,7 +96,8 @@ def with_loose_points(scene: Scene, cancelled: Callable[[], bool]) -> Scene:
     """The scene with those of its points without tracks that some photo shows in their colour.
 
     None are kept where photos show the colours hardly more often than exchanged ones: the points then lie in another
-    frame than the cameras. Points that all have one colour get that of the photos.
+    frame than the cameras. Points that all have one colour get the median of the photos that see them; none are kept
+    where the photos agree on these no more than by chance.
     """
     given = len(scene.points)
     if scene.point_views is not None or not given:
@@ -105,10 +107,18 @@ def with_loose_points(scene: Scene, cancelled: Callable[[], bool]) -> Scene:
     views = [view for view in scene.views if view.split != "test"]
     evidence = evidence_of(points, colors, views, cancelled)
     plain = bool((colors == colors[0]).all())
-    kept = evidence.shown > 0 if plain else evidence.agreeing > 0
+    seen = seen_in(points, views, cancelled) if plain else None
+    kept = evidence.agreeing > 0 if seen is None else seen.counts > 0
     kept &= evidence.inside
     note = _loose_note(given, len(points), int(kept.sum()), evidence, plain)
-    if not plain and _elsewhere(evidence):
+    if seen is not None and seen.contradicted:
+        kept[:] = False
+        note = (
+            f"The {given} points that came without tracks and without colours are not used: at their places, the "
+            f"photos differ by {seen.spread:.0f} levels of 255, and at exchanged places by {seen.by_chance:.0f}. Their "
+            "coordinates are probably not those of the cameras."
+        )
+    elif seen is None and _elsewhere(evidence):
         kept[:] = False
         note = (
             f"The {given} points that came without tracks are not used: the photos show their colours at "
@@ -118,7 +128,7 @@ def with_loose_points(scene: Scene, cancelled: Callable[[], bool]) -> Scene:
     return replace(
         scene,
         points=points[kept],
-        colors=(evidence.colors if plain else colors)[kept],
+        colors=(colors if seen is None else seen.colors)[kept],
         notes=(*scene.notes, note),
         facts=scene.facts
         | {

@@ -1,0 +1,150 @@
+"""Whether the photos show the points of a scan where they lie, and which of these are used."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from splatmill_worker.scene import Float, PointViews, Scene
+from splatmill_worker.sfm import posed
+from splatmill_worker.sfm.alignment import Unaligned, align
+
+LEAST_SHARE = 0.5
+"""Share of the agreement of the scene's own points with the photos, above chance, that an aligned scan has at least
+(decisions: scan-agreement)."""
+
+Colors = npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """How a scan was brought to the scene, for the report.
+
+    share: of the points of the scene that lie on the scan.
+    residual: median distance of these from the scan, in units of the scan.
+    scale: length in the scene of one unit of the scan.
+    matrix: 4x4 by rows, from the coordinates of the scan to those of the scene.
+    """
+
+    share: float
+    residual: float
+    scale: float
+    matrix: list[list[float]]
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The points of a scan in a scene.
+
+    points: those that are used [n,3], in the scene's coordinates; none where they do not fit.
+    colors: of these, from the photos where the scan has none [n,3].
+    resolved: number of points that were left by what the photos resolve.
+    sentence: what the photos say of them, with the numbers.
+    alignment: how they came there; None where they lay there.
+    """
+
+    points: Float
+    colors: Colors
+    resolved: int
+    sentence: str
+    alignment: Alignment | None = None
+
+    @property
+    def fits(self) -> bool:
+        """Whether any point is used."""
+        return len(self.points) > 0
+
+
+def as_it_lies(
+    scene: Scene, points: Float, colors: Colors, side: int | None, cancelled: Callable[[], bool]
+) -> Fit:
+    """The points of a scan in the coordinates of the scene's cameras, judged as a data set's own points are.
+
+    points, colors: of the scan [n,3].
+    side: pixels of the longest side of the photos that are trained on; None: their full size.
+    """
+    views = [view for view in scene.views if view.split != "test"]
+    rows = posed.resolved(points, posed.footprints(points, views, side, cancelled))
+    if not len(rows):
+        return Fit(points[rows], colors[rows], 0, "No photo shows any of its points.")
+    judged = posed.with_loose_points(
+        replace(
+            scene, points=points[rows], colors=colors[rows], point_views=None, point_errors=None, notes=()
+        ),
+        cancelled,
+    )
+    return Fit(judged.points, judged.colors, len(rows), " ".join(judged.notes))
+
+
+def aligned(
+    scene: Scene,
+    points: Float,
+    colors: Colors,
+    side: int | None,
+    seed: int,
+    cancelled: Callable[[], bool],
+) -> Fit:
+    """The points of a scan brought onto the scene's own by a similarity, if the photos then show their colours.
+
+    How often photos show the colours of the scene's own points, above chance, says what can be expected. A scan without
+    colours is not aligned: where it lies wrong, photos agree on the colours at its places nearly as well.
+
+    Raises Cancelled.
+    """
+    nothing = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+    if (colors == colors[0]).all():
+        return Fit(
+            *nothing, 0, "They have no colours, by which they could be aligned to the points of the photos."
+        )
+    found = align(points, colors, scene.points, scene.colors, seed=seed, cancelled=cancelled)
+    if isinstance(found, Unaligned):
+        return Fit(*nothing, 0, f"They could not be aligned to the points of the photos: {found.reason}.")
+    views = [view for view in scene.views if view.split != "test"]
+    moved = found.similarity.points(points)
+    rows = posed.resolved(moved, posed.footprints(moved, views, side, cancelled))
+    how = Alignment(
+        round(found.share, 4), found.residual, found.similarity.scale, found.similarity.matrix.tolist()
+    )
+    said = (
+        f"Aligned as well as they can be, {100 * found.share:.0f} % of the points of the photos lie on them, half of "
+        f"these within {found.residual:.3g} of the file's units."
+    )
+    if not len(rows):
+        return Fit(*nothing, 0, f"{said} No photo shows any of them.", how)
+    moved, own = moved[rows], colors[rows]
+    stride = -(-len(rows) // posed.MOST_LOOSE)
+    moved, own = moved[::stride], own[::stride]
+    evidence = posed.evidence_of(moved, own, views, cancelled)
+    reference = posed.evidence_of(*_some(scene), views, cancelled)
+    said += (
+        f" The photos show their colours at {100 * evidence.agreement:.0f} % of the places, exchanged colours at "
+        f"{100 * evidence.chance:.0f} %; those of the points of the photos, at {100 * reference.agreement:.0f} % "
+        f"and {100 * reference.chance:.0f} %."
+    )
+    above_chance = evidence.agreement - evidence.chance
+    fits = above_chance > LEAST_SHARE * max(0.0, reference.agreement - reference.chance)
+    kept = (evidence.agreeing > 0) & evidence.inside & fits
+    return Fit(moved[kept], own[kept], len(rows), said, how)
+
+
+def point_views(scene: Scene, points: Float) -> PointViews:
+    """The views that see points [n,3], as far as these hide each other; test views of a data set take no part."""
+    rows, views = [np.zeros(0, np.intp)], [np.zeros(0, np.int32)]
+    for index, view in enumerate(scene.views):
+        if view.split != "test":
+            seen = posed.visible(view.camera, view.camera.project(points))
+            rows.append(seen)
+            views.append(np.full(len(seen), index, np.int32))
+    of_point = np.concatenate(rows)
+    order = np.argsort(of_point, kind="stable")
+    offsets = np.concatenate([[0], np.cumsum(np.bincount(of_point, minlength=len(points)))]).astype(np.int64)
+    return PointViews(offsets, np.concatenate(views)[order])
+
+
+def _some(scene: Scene, most: int = 5_000) -> tuple[Float, Colors]:
+    """The points of the scene and their colours, or some of them, evenly chosen."""
+    stride = max(1, -(-len(scene.points) // most))
+    return scene.points[::stride], scene.colors[::stride]

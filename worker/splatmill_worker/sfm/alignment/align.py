@@ -1,0 +1,200 @@
+"""Finds the similarity from the coordinates of a scan to those of a scene by the points of both."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from splatmill_worker.scene import Float, Similarity
+from splatmill_worker.sfm.alignment import icp, triangles
+from splatmill_worker.sfm.alignment.cells import spread
+from splatmill_worker.sfm.alignment.cloud import Cloud, degenerate
+from splatmill_worker.sfm.callbacks import stop_if
+
+SCENE_POINTS = 3_000
+"""Points of the scene that are compared."""
+
+SPARSE, DENSE = (4_000, 20_000), 100_000
+"""Points of the scan that the first guess is searched with, in turns: of a scan that has much more than the scene, many
+are needed. And those that it is refined with."""
+
+READ = 300_000
+"""Points of a scan from which these are chosen."""
+
+NEAR = 0.02
+"""Distance, in radii of the scene, within which a point of the scene lies on the scan. Points of structure from motion
+are sure to a pixel or two of some hundred."""
+
+ROUNDS = 400
+"""Triangles that are tried, at most."""
+
+VOTES, EVIDENT = 3, 0.15
+"""Triangles that lead to the same similarity, and the share of the points of the scene in place and colour, above that
+by chance, with which the search ends before all are tried."""
+
+MANY_VOTES = 6
+"""Triangles that lead to the same similarity, with which the search ends whatever the share is: a scan may have a tenth
+of the scene."""
+
+MIRRORED = 1.1
+"""Ratio of the shares of a mirror image and of the scan from which the scan is mirrored; 1 for a plane."""
+
+KEPT = 20
+"""Similarities that votes are counted for."""
+
+SAME = 0.1
+"""Median distance between the points as two similarities place them, in their radii, up to which these are the same."""
+
+
+@dataclass(frozen=True)
+class Aligned:
+    """The similarity of a scan to a scene.
+
+    similarity: from the scan's coordinates to those of the scene.
+    share: of the points of the scene that lie on the scan.
+    residual: median distance of these from the scan's surfaces, in units of the scan.
+    """
+
+    similarity: Similarity
+    share: float
+    residual: float
+
+
+@dataclass(frozen=True)
+class Unaligned:
+    """No similarity was found; `reason` is the end of a sentence."""
+
+    reason: str
+
+
+def align(
+    points: Float,
+    colors: npt.NDArray[np.uint8],
+    scene_points: Float,
+    scene_colors: npt.NDArray[np.uint8],
+    *,
+    seed: int = 0,
+    cancelled: Callable[[], bool] = lambda: False,
+) -> Aligned | Unaligned:
+    """Return the similarity that brings the points of a scan onto those of a scene, or why there is none.
+
+    It is the best that was found: whether it is right, the photos have to tell.
+
+    points: of the scan [n,3], in any unit, rotated and shifted; coordinates of millions lose nothing.
+    colors: RGB of these [n,3].
+    scene_points, scene_colors: of the scene [m,3].
+
+    Raises ImportError without scipy, and Cancelled.
+    """
+    random = np.random.default_rng(seed)
+    if (reason := degenerate(scene_points)) is not None:
+        return Unaligned(f"of the cloud of the photos, {reason}")
+    # Near the origin, so that squares lose no digits.
+    middle, about = np.median(points, axis=0), np.median(scene_points, axis=0)
+    some = random.choice(len(points), READ, replace=False) if len(points) > READ else np.arange(len(points))
+    dense = spread(points[some] - middle, DENSE)
+    dense = some[dense]
+    if (reason := degenerate(points[dense] - middle)) is not None:
+        return Unaligned(f"of the file, {reason}")
+    scan = Cloud.of(points[dense] - middle, colors[dense])
+    rows = spread(scene_points - about, SCENE_POINTS)
+    scene = Cloud.of(scene_points[rows] - about, scene_colors[rows])
+    if not (scan.radius > 0.0 and scene.radius > 0.0):
+        return Unaligned("more than half of the points lie at one place")
+    found = _search(scene, scan, random, cancelled)
+    if found is None:
+        return Unaligned("no part of it has the shape and the colours of a part of the scene")
+    normals = icp.normals_of(scan)
+    best = _finished(scene, scan, found, normals)
+    mirrored = _finished(scene, *_mirrored(scene, scan, best.similarity), normals=None)
+    if mirrored.share > MIRRORED * best.share:
+        return Unaligned(
+            f"its mirror image fits better, with {100 * mirrored.share:.0f} % of the points of the photos on it in "
+            f"place of {100 * best.share:.0f} %. Exchange the sign of one axis"
+        )
+    outward = Similarity(np.eye(3), 1.0, about)
+    return replace(best, similarity=Similarity(np.eye(3), 1.0, -middle).then(best.similarity).then(outward))
+
+
+def _mirrored(scene: Cloud, scan: Cloud, similarity: Similarity) -> tuple[Cloud, Similarity]:
+    """The mirror image of a scan, in the plane nearest to its points that the scene has, and its similarity: what the
+    scene has in that plane stays where it is."""
+    partners = icp.pairs(scene, scan, similarity, _near(scene, scan, similarity)).partners
+    plane = scan.points[partners] if len(partners) >= icp.FEWEST else scan.points
+    middle = np.median(plane, axis=0)
+    normal = np.linalg.svd(plane - middle, full_matrices=False)[2][2]
+    points = scan.points - 2.0 * ((scan.points - middle) @ normal)[:, None] * normal
+    return Cloud.of(points, scan.colors), similarity
+
+
+def _finished(scene: Cloud, scan: Cloud, first: Similarity, normals: Float | None) -> Aligned:
+    """The similarity refined with all points of the scan, and how well it fits. normals: of the scan, or None."""
+    normals = icp.normals_of(scan) if normals is None else normals
+    limit = max(3.0 * NEAR * scene.radius, 3.0 * scan.spacing * first.scale)
+    nearer = icp.refined(scene, scan, first, limit, 10)
+    best = icp.refined(scene, scan, nearer, limit, 20, normals)
+    found = icp.pairs(scene, scan, best, _near(scene, scan, best))
+    if not len(found.rows):
+        return Aligned(best, 0.0, float("inf"))
+    apart = scene.points[found.rows] - best.points(scan.points[found.partners])
+    off = np.abs((apart * (normals[found.partners] @ best.rotation.T)).sum(axis=1)) / best.scale
+    return Aligned(best, len(found.rows) / len(scene.points), float(np.median(off)))
+
+
+def _near(scene: Cloud, scan: Cloud, similarity: Similarity) -> float:
+    """Distance within which a point of the scene lies on the scan, in units of the scene."""
+    return max(NEAR * scene.radius, 1.5 * scan.spacing * similarity.scale)
+
+
+def _search(
+    scene: Cloud, scan: Cloud, random: np.random.Generator, cancelled: Callable[[], bool]
+) -> Similarity | None:
+    """The similarity that triangles of equal colours lead to, again and again; that with the most points otherwise."""
+    clouds = [scan.thinned(count) for count in SPARSE]
+    palettes = [triangles.Palette.of(scene, each) for each in clouds]
+    exchanged = replace(scene, colors=scene.colors[random.permutation(len(scene.colors))])
+    best: list[tuple[float, int, Similarity]] = []
+    for count in range(ROUNDS):
+        stop_if(cancelled)
+        reached: list[tuple[float, Similarity]] = []
+        scan, palette = clouds[count % len(clouds)], palettes[count % len(clouds)]
+        for guess in triangles.guesses(scene, scan, palette, random):
+            moved = icp.refined(scene, scan, guess, 4.0 * scan.spacing * guess.scale, 8)
+            reached.append((_score(scene, exchanged, scan, moved), moved))
+        if not reached:
+            continue
+        score, similarity = max(reached, key=lambda each: each[0])
+        if score > 0.5 * max((entry[0] for entry in best), default=0.0):
+            limit = 2.0 * _near(scene, scan, similarity)
+            similarity = icp.refined(scene, scan, similarity, limit, 12)
+            score = _score(scene, exchanged, scan, similarity)
+        same = [entry for entry in best if _same(scene, scan, entry[2], similarity)]
+        best = [entry for entry in best if entry not in same]
+        top = max([(score, similarity), *((entry[0], entry[2]) for entry in same)], key=lambda each: each[0])
+        best.append((top[0], 1 + sum(entry[1] for entry in same), top[1]))
+        best.sort(key=lambda entry: -entry[0])
+        best = best[:KEPT]
+        score, votes, _ = best[0]
+        if votes >= MANY_VOTES or (votes >= VOTES and score > EVIDENT):
+            break
+    return best[0][2] if best and best[0][0] > 0.0 else None
+
+
+def _score(scene: Cloud, exchanged: Cloud, scan: Cloud, similarity: Similarity) -> float:
+    """Share of the points of the scene that the scan has, less that with their colours exchanged."""
+    limit = _near(scene, scan, similarity)
+    own, other = (len(icp.pairs(each, scan, similarity, limit).rows) for each in (scene, exchanged))
+    return (own - other) / len(scene.points)
+
+
+def _same(scene: Cloud, scan: Cloud, one: Similarity, other: Similarity) -> bool:
+    """Whether two similarities place the points of the scan that the scene has at the same places."""
+    partners = icp.pairs(scene, scan, one, _near(scene, scan, one)).partners
+    if not len(partners):
+        return False
+    first, second = one.points(scan.points[partners]), other.points(scan.points[partners])
+    radius = float(np.median(np.linalg.norm(first - np.median(first, axis=0), axis=1)))
+    return bool(np.median(np.linalg.norm(first - second, axis=1)) < SAME * radius)
