@@ -16,7 +16,7 @@ import torch
 from _rows import Row, origin, worked
 from torch import Tensor
 
-from _train import bare, few, instead
+from _train import bare, few, instead, scanned
 from _train.configurations import revised
 from _train.outliers import judged
 from _train.perceived import perceived
@@ -228,6 +228,9 @@ def _posed(job: Row, options: TrainOptions) -> Scene:
     if job["made"] in bare.SCENES:
         if not capture.is_dir():
             bare.make(job["made"], capture, PHOTOS)
+    elif job["made"] in scanned.SCENES:
+        if not capture.is_dir():
+            scanned.make(capture, PHOTOS)
     elif job["made"] in few.SCENES:
         if not capture.is_dir():
             whole = TrainOptions.model_validate(job["whole"]["options"])

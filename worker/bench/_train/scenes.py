@@ -8,7 +8,7 @@ from typing import Any
 
 from _data import FOLDERS, SHARED
 
-from _train import bare, few
+from _train import bare, few, scanned
 from splatmill_worker.synthetic import Light, Movers
 
 SIDE = 480
@@ -50,7 +50,7 @@ with darker corners, and with local tone mapping. And with things that stand in 
 MADE: dict[str, dict[str, Any]] = {"synthetic": {}, **PLANTED}
 """What is planted in the photos of each built-in scene: arguments of `synthetic.capture`."""
 
-COMPARED = (*PLANTED, *bare.SCENES, *few.SCENES, FOLDED, OFFICIAL)
+COMPARED = (*PLANTED, *bare.SCENES, *few.SCENES, *scanned.SCENES, FOLDED, OFFICIAL)
 """Made for one comparison each; how soon they are learnt says nothing beside the captures that they are made of."""
 
 ALL = (*KNOWN, *COMPARED)
@@ -69,6 +69,9 @@ def named(text: str, work: Path) -> Scene:
                 f"{text} is left out: fox is not in ../shared/data, and no part of the project."
             )
         return Scene(text, work / text / "capture", posed=True, made=text)
+    if text in scanned.SCENES:
+        options = {"image_size": SIDE, "holdout": 8, "start": scanned.FILE}
+        return Scene(text, work / text / "capture", options, made=text)
     if text in few.SCENES:
         whole = named(few.SCENES[text][0], work)
         options = {**whole.options, "test_views": few.held_out(text)}

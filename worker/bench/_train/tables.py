@@ -8,7 +8,7 @@ from pathlib import Path
 from _page import beside, section, table
 from _rows import Row, footer
 
-from _train import bare
+from _train import bare, scanned
 from _train.ablation import ablation
 from _train.configurations import DEFAULT
 from _train.rows import QUIET, by_time, disturbed, failed, grouped, latest_default, once, whole
@@ -45,6 +45,7 @@ def document(rows: list[Row], references: list[Row], rows_at: Path, here: Path, 
         *section("Goals", goals(timed, references)),
         *section("Other trainers' models, judged on the same views", peers(rows)),
         *section("Cameras without points", without_points(rows)),
+        *section("A scan to start from", with_scan(rows)),
         *section("Photos that disagree", found(rows)),
         *section("One switch at a time", ablation(rows)),
         *section("What was left out", left_out(rows)),
@@ -212,6 +213,28 @@ def without_points(rows: list[Row]) -> str:
             loss = f"{mine.median - theirs.median:+.2f}"
             lines.append([scene, budget, len(without), mine.text(2), having, theirs.text(2), loss])
     head = "cameras alone|budget|seeds|PSNR dB|the same with points|PSNR dB|difference, dB"
+    return table(head, lines) if lines else ""
+
+
+def with_scan(rows: list[Row]) -> str:
+    """A table of captures that come with a scan, each beside the same photos alone."""
+    ours = whole(once([row for row in rows if row["kind"] == "run" and row["config"] == DEFAULT]))
+    groups = grouped(ours, "scene", "budget", "code")
+    last = {(scene, budget): code for scene, budget, code in groups if scene in scanned.SCENES}
+    lines = []
+    for (scene, budget), code in last.items():
+        alone = scanned.WITHOUT_SCAN[scene]
+        having, photos = groups[scene, budget, code], groups.get((alone, budget, code))
+        if photos:
+            mine, theirs = (Spread.of(row["psnr"] for row in group) for group in (having, photos))
+            spent = [
+                f"{Spread.of(row['wall_seconds'] for row in group).median:.0f}" for group in (having, photos)
+            ]
+            gain = f"{mine.median - theirs.median:+.2f}"
+            lines.append(
+                [scene, budget, len(having), mine.text(2), spent[0], alone, theirs.text(2), spent[1], gain]
+            )
+    head = "with a scan|budget|seeds|PSNR dB|all wall s|photos alone|PSNR dB|all wall s|difference, dB"
     return table(head, lines) if lines else ""
 
 
