@@ -309,8 +309,9 @@ def _points() -> list[str]:
         GPS nor `scale` gives a unit, the model is then in metres. Those of other formats may be anything.
 
         Of more than {scan.MOST:,} points, evenly chosen ones are read. Of these, one stays for each pixel
-        of the photo that shows its place closest, and at most {points.MOST_LOOSE:,} are used; the log has
-        the numbers.""",
+        of the photo that shows its place closest, or for each of larger cells where more would stay than
+        {scan_fit.STARTED:.0%} of the Gaussians that the photos resolve, {scan_fit.FEW:,} in any case and
+        {points.MOST_LOOSE:,} at most. The log has the numbers.""",
     ]
 
 

@@ -19,8 +19,9 @@ from PIL import Image
 from torch import Tensor
 
 from splatmill.schema import Switch, TrainOptions
-from splatmill_worker import pipeline
+from splatmill_worker import pipeline, synthetic
 from splatmill_worker.__main__ import main
+from splatmill_worker.readers import point_file
 from splatmill_worker.scene import Camera
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.train.disagreement import Disagreement
@@ -76,6 +77,7 @@ def parts(monkeypatch: pytest.MonkeyPatch) -> Any:
                 "perceived",
                 "rows",
                 "run",
+                "scanned",
                 "scenes",
                 "spread",
                 "tables",
@@ -287,6 +289,33 @@ def test_cameras_without_points_stand_beside_the_same_capture_with_them(parts: A
     assert without([*given, *(each | {"code": "newer"} for each in alone)]) == "", (
         "fox was measured with older code"
     )
+
+
+def test_a_scan_stands_beside_the_same_photos_alone(parts: Any, place: Path) -> None:
+    with_scan = parts["_train.tables"].with_scan
+    row = next(row for row in rows_of(place) if row["kind"] == "run") | {"config": "default"}
+    alone = like(row, scene="synthetic", psnr=30.0, wall_seconds=20.0)
+    having = like(row, scene="synthetic-scanned", psnr=30.7, wall_seconds=31.0)
+    assert with_scan([alone, having]).endswith(
+        "| synthetic-scanned | 30steps | 1 | 30.70 | 31 | synthetic | 30.00 | 20 | +0.70 |"
+    )
+    assert with_scan([having]) == "", "the photos alone were not measured"
+
+
+def test_the_scan_lies_elsewhere_than_the_still_life(
+    parts: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scanned = parts["_train.scanned"]
+    monkeypatch.setattr(scanned, "RAYS", (24, 18))
+    scanned.make(tmp_path / "capture", 1)
+    assert len(list((tmp_path / "capture" / "images").iterdir())) == 1
+    points, colors = point_file.read(tmp_path / "capture" / "poses" / scanned.FILE)
+    truth, true_colors = synthetic.scan(24, 18)
+    np.testing.assert_allclose(points, scanned.TO_SCANNER.points(truth), atol=1e-6)
+    np.testing.assert_array_equal(colors, true_colors)
+    rotation = scanned.TO_SCANNER.rotation
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(rotation) == pytest.approx(1.0)
 
 
 def test_the_share_of_planted_pixels_that_was_found(parts: Any, place: Path) -> None:

@@ -58,7 +58,7 @@ def test_points_of_a_scan_come_beside_those_of_the_photos(name: str, capture: Pa
     near = np.abs(scene.points[-used:, None] - points[None]).max(axis=2).min(axis=1)
     assert near.max() < 1e-3
     assert len(scene.points) > used + 50  # a scan has holes, so that the data set's own points stay
-    assert f"{name} holds {len(points):,} points. One for each pixel" in scene.notes[-1]
+    assert f"{name} holds {len(points):,} points. One for each cell of 1.0 pixels" in scene.notes[-1]
     assert f"of which {used:,} are used" in scene.notes[-1]
     assert used <= scene.facts["given_points_resolved"] <= len(points)
     assert "given_points_alignment" not in scene.facts
@@ -74,6 +74,7 @@ def test_a_scan_beside_a_zip_of_photos_and_cameras(capture: Path, tmp_path: Path
     assert load(zipped, tmp_path, "scan.laz").facts["given_points_used"] > 1000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", ["axes", "units"])
 def test_points_elsewhere_are_aligned(change: str, capture: Path, tmp_path: Path) -> None:
     points, colors = scanned()
@@ -105,6 +106,7 @@ def with_own_points(capture: Path) -> np.ndarray:
     return points
 
 
+@pytest.mark.slow
 def test_a_scan_of_another_place_is_refused_with_the_share(capture: Path, tmp_path: Path) -> None:
     with_own_points(capture)
     random = np.random.default_rng(0)
@@ -116,11 +118,9 @@ def test_a_scan_of_another_place_is_refused_with_the_share(capture: Path, tmp_pa
         load(capture, tmp_path, "scan.ply")
     assert refused.value.code == "start_unusable"
     assert (
-        "The points of scan.ply do not fit the photos. As they lie: No photo shows any"
-        in refused.value.message
+        "The points of scan.ply do not fit the photos. As they lie: The photos show" in refused.value.message
     )
     assert "% of the points of the photos lie on them" in refused.value.message
-    assert "exchanged colours at" in refused.value.message
 
 
 def test_cameras_without_points_of_their_own_align_nothing(capture: Path, tmp_path: Path) -> None:

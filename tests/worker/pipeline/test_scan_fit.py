@@ -21,6 +21,8 @@ from splatmill_worker.scene import Float, PointViews, Scene, Similarity
 from tests.support import still_life
 from tests.worker.readers.test_scan import write_las, write_ply
 
+pytestmark = pytest.mark.slow
+
 TURN = Similarity(
     np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), 250.0, np.array([500_000.0, 5_400_000.0, 300.0])
 )
@@ -150,6 +152,14 @@ def test_a_file_that_determines_nothing_is_refused(points: Float, scene: Scene, 
     assert "do not fit the photos" in refused.value.message
 
 
+def test_the_number_of_points_follows_the_photos(scene: Scene) -> None:
+    assert scan_fit.most(scene.views, None) == 20_000
+    large = [replace(view, camera=view.camera.scaled_to(4000, 3000)) for view in scene.views]
+    # 14 photos of 12 million pixels, 50 for each Gaussian, a fifth of these: more than the limit of 200,000.
+    assert scan_fit.most(large, None) == 200_000
+    assert scan_fit.most(large, 1000) == pytest.approx(0.2 * 14 * 750_000 / 50, abs=1)
+
+
 def test_a_scan_without_colours_is_not_aligned(scene: Scene) -> None:
     points, colors = scanned()
     fit = aligned(scene, TURN.points(points), np.full_like(colors, 128))
@@ -157,7 +167,6 @@ def test_a_scan_without_colours_is_not_aligned(scene: Scene) -> None:
     assert "They have no colours" in fit.sentence
 
 
-@pytest.mark.slow
 def test_a_scan_and_photos_alone(tmp_path: Path) -> None:
     capture = tmp_path / "capture"
     truth = synthetic.capture(capture / "images", 16, 320, 240, samples=1)

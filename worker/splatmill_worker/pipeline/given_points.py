@@ -97,8 +97,8 @@ def with_given_points(
         "sparse_points": scene.facts.get("sparse_points", len(scene.points)),
     }
     notes = [
-        f"{path.name} holds {count:,} points. One for each pixel of the closest photo leaves {fit.resolved:,}, of "
-        f"which {len(fit.points):,} are used: photos show their colours."
+        f"{path.name} holds {count:,} points. One for each cell of {fit.pixels:.1f} pixels of the closest photo leaves "
+        f"{fit.resolved:,}, of which {len(fit.points):,} are used: photos show their colours."
     ]
     if fit.alignment is not None:
         facts["given_points_alignment"] = asdict(fit.alignment)

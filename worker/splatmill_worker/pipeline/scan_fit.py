@@ -2,19 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from splatmill_worker.scene import Float, PointViews, Scene
+from splatmill_worker.scene import Float, PointViews, Scene, View
 from splatmill_worker.sfm import posed
 from splatmill_worker.sfm.alignment import Unaligned, align
+from splatmill_worker.splat.plan import capacity
+
+STARTED = 0.2
+"""Share of the Gaussians that the photos resolve which a scan gives, at most (decisions: scan-points)."""
+
+FEW = 20_000
+"""Points of a scan that are used in any case."""
 
 LEAST_SHARE = 0.5
 """Share of the agreement of the scene's own points with the photos, above chance, that an aligned scan has at least
 (decisions: scan-agreement)."""
+
+LEAST_SHOWN = 20
+"""Points of a scan that photos show at different places, and of the scene, below which nothing can be said."""
 
 Colors = npt.NDArray[np.uint8]
 
@@ -42,6 +52,7 @@ class Fit:
     points: those that are used [n,3], in the scene's coordinates; none where they do not fit.
     colors: of these, from the photos where the scan has none [n,3].
     resolved: number of points that were left by what the photos resolve.
+    pixels: of the closest photo for one of these.
     sentence: what the photos say of them, with the numbers.
     alignment: how they came there; None where they lay there.
     """
@@ -49,6 +60,7 @@ class Fit:
     points: Float
     colors: Colors
     resolved: int
+    pixels: float
     sentence: str
     alignment: Alignment | None = None
 
@@ -61,22 +73,28 @@ class Fit:
 def as_it_lies(
     scene: Scene, points: Float, colors: Colors, side: int | None, cancelled: Callable[[], bool]
 ) -> Fit:
-    """The points of a scan in the coordinates of the scene's cameras, judged as a data set's own points are.
+    """The points of a scan in the coordinates of the scene's cameras, judged by the photos as aligned ones are; where
+    the scene has no points of its own, or the scan no colours, as points that come with a data set are.
 
     points, colors: of the scan [n,3].
     side: pixels of the longest side of the photos that are trained on; None: their full size.
     """
     views = [view for view in scene.views if view.split != "test"]
-    rows = posed.resolved(points, posed.footprints(points, views, side, cancelled))
-    if not len(rows):
-        return Fit(points[rows], colors[rows], 0, "No photo shows any of its points.")
+    rows, pixels = posed.resolved(points, posed.footprints(points, views, side, cancelled), most(views, side))
+    if len(rows) < LEAST_SHOWN:
+        said = f"The photos show {len(rows)} of its points apart from each other."
+        return _none(said)
+    plain = bool((colors == colors[0]).all())
+    if not plain and len(scene.points) >= LEAST_SHOWN:
+        kept, said = _shown(scene, points[rows], colors[rows], cancelled)
+        return Fit(points[rows][kept], colors[rows][kept], len(rows), pixels, said)
     judged = posed.with_loose_points(
         replace(
             scene, points=points[rows], colors=colors[rows], point_views=None, point_errors=None, notes=()
         ),
         cancelled,
     )
-    return Fit(judged.points, judged.colors, len(rows), " ".join(judged.notes))
+    return Fit(judged.points, judged.colors, len(rows), pixels, " ".join(judged.notes))
 
 
 def aligned(
@@ -94,17 +112,14 @@ def aligned(
 
     Raises Cancelled.
     """
-    nothing = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     if (colors == colors[0]).all():
-        return Fit(
-            *nothing, 0, "They have no colours, by which they could be aligned to the points of the photos."
-        )
+        return _none("They have no colours, by which they could be aligned to the points of the photos.")
     found = align(points, colors, scene.points, scene.colors, seed=seed, cancelled=cancelled)
     if isinstance(found, Unaligned):
-        return Fit(*nothing, 0, f"They could not be aligned to the points of the photos: {found.reason}.")
+        return _none(f"They could not be aligned to the points of the photos: {found.reason}.")
     views = [view for view in scene.views if view.split != "test"]
     moved = found.similarity.points(points)
-    rows = posed.resolved(moved, posed.footprints(moved, views, side, cancelled))
+    rows, pixels = posed.resolved(moved, posed.footprints(moved, views, side, cancelled), most(views, side))
     how = Alignment(
         round(found.share, 4), found.residual, found.similarity.scale, found.similarity.matrix.tolist()
     )
@@ -112,22 +127,41 @@ def aligned(
         f"Aligned as well as they can be, {100 * found.share:.0f} % of the points of the photos lie on them, half of "
         f"these within {found.residual:.3g} of the file's units."
     )
-    if not len(rows):
-        return Fit(*nothing, 0, f"{said} No photo shows any of them.", how)
+    if len(rows) < LEAST_SHOWN:
+        return _none(f"{said} The photos show {len(rows)} of them apart from each other.", how)
     moved, own = moved[rows], colors[rows]
-    stride = -(-len(rows) // posed.MOST_LOOSE)
-    moved, own = moved[::stride], own[::stride]
-    evidence = posed.evidence_of(moved, own, views, cancelled)
+    kept, seen = _shown(scene, moved, own, cancelled)
+    return Fit(moved[kept], own[kept], len(rows), pixels, f"{said} {seen}", how)
+
+
+def _none(sentence: str, alignment: Alignment | None = None) -> Fit:
+    return Fit(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), 0, 1.0, sentence, alignment)
+
+
+def _shown(
+    scene: Scene, points: Float, colors: Colors, cancelled: Callable[[], bool]
+) -> tuple[npt.NDArray[np.bool_], str]:
+    """Which points [n,3] photos show in their colours; none, unless they do so about as often as the scene's own."""
+    views = [view for view in scene.views if view.split != "test"]
+    evidence = posed.evidence_of(points, colors, views, cancelled)
     reference = posed.evidence_of(*_some(scene), views, cancelled)
-    said += (
-        f" The photos show their colours at {100 * evidence.agreement:.0f} % of the places, exchanged colours at "
+    above_chance = evidence.agreement - evidence.chance
+    fits = above_chance > LEAST_SHARE * max(0.0, reference.agreement - reference.chance)
+    return (evidence.agreeing > 0) & evidence.inside & fits, (
+        f"The photos show their colours at {100 * evidence.agreement:.0f} % of the places, exchanged colours at "
         f"{100 * evidence.chance:.0f} %; those of the points of the photos, at {100 * reference.agreement:.0f} % "
         f"and {100 * reference.chance:.0f} %."
     )
-    above_chance = evidence.agreement - evidence.chance
-    fits = above_chance > LEAST_SHARE * max(0.0, reference.agreement - reference.chance)
-    kept = (evidence.agreeing > 0) & evidence.inside & fits
-    return Fit(moved[kept], own[kept], len(rows), said, how)
+
+
+def most(views: Sequence[View], side: int | None) -> int:
+    """Points of a scan that are used at most with these photos, whose longest side is reduced to `side`."""
+    pixels = 0.0
+    for view in views:
+        camera = view.camera
+        reduced = 1.0 if side is None else min(1.0, side / max(camera.width, camera.height))
+        pixels += reduced**2 * camera.width * camera.height
+    return min(posed.MOST_LOOSE, max(FEW, round(STARTED * capacity.resolved(pixels, 1))))
 
 
 def point_views(scene: Scene, points: Float) -> PointViews:

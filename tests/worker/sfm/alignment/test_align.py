@@ -15,6 +15,8 @@ from splatmill_worker.sfm.alignment import Aligned, Unaligned, align
 from splatmill_worker.sfm.alignment.cells import in_cells, spread
 from tests.support import still_life
 
+pytestmark = pytest.mark.slow
+
 UTM = np.array([500_000.0, 5_400_000.0, 300.0])
 
 
@@ -61,7 +63,16 @@ def test_duplicates_change_nothing_about_the_place() -> None:
     assert error(found, truth, own.points) < 0.01
 
 
-@pytest.mark.slow
+def test_a_point_at_the_end_of_the_world_changes_nothing() -> None:
+    points, colors = scanned()
+    own = still_life.scene()
+    points, colors = points.copy(), colors.copy()
+    points[7] = 1e200
+    found = align(points, colors, own.points, own.colors)
+    assert isinstance(found, Aligned)
+    assert error(found, Similarity(np.eye(3), 1.0, np.zeros(3)), own.points) < 0.01
+
+
 def test_a_scan_of_a_part_of_the_scene_is_brought_back() -> None:
     points, colors = synthetic.scan(240, 180)
     near = np.linalg.norm(points - np.array([0.0, 0.0, 0.4]), axis=1)
@@ -75,7 +86,6 @@ def test_a_scan_of_a_part_of_the_scene_is_brought_back() -> None:
     assert error(found, truth, own.points[there]) < 0.05
 
 
-@pytest.mark.slow
 def test_a_scan_of_a_house_around_the_scene_is_brought_back() -> None:
     points, colors = synthetic.scan(240, 180)
     random = np.random.default_rng(0)

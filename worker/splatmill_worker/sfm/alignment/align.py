@@ -21,6 +21,9 @@ SPARSE, DENSE = (4_000, 20_000), 100_000
 """Points of the scan that the first guess is searched with, in turns: of a scan that has much more than the scene, many
 are needed. And those that it is refined with."""
 
+FAR = 1e4
+"""Median distances from the median, behind which a point of a scan is taken for a fault of the scanner."""
+
 READ = 300_000
 """Points of a scan from which these are chosen."""
 
@@ -95,6 +98,8 @@ def align(
     # Near the origin, so that squares lose no digits.
     middle, about = np.median(points, axis=0), np.median(scene_points, axis=0)
     some = random.choice(len(points), READ, replace=False) if len(points) > READ else np.arange(len(points))
+    distances = np.abs(points[some] - middle).max(axis=1)
+    some = some[distances <= FAR * max(float(np.median(distances)), np.finfo(np.float64).tiny)]
     dense = spread(points[some] - middle, DENSE)
     dense = some[dense]
     if (reason := degenerate(points[dense] - middle)) is not None:

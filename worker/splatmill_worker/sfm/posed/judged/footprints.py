@@ -33,15 +33,27 @@ def footprints(
     return smallest
 
 
-def resolved(points: Float, sizes: Float) -> npt.NDArray[np.intp]:
-    """Rows, in order, of the points [n,3] that are shown, one of each cell as large as a pixel is there.
+GROWTH = 2.0**0.5
+"""Factor by which cells grow where too many points are left."""
 
-    sizes: of a pixel at each point [n], as `footprints` returns them. The sizes of cells are powers of two, so that
-        they do not overlap: 0.7 to 1.4 pixels.
+
+def resolved(points: Float, sizes: Float, most: int) -> tuple[npt.NDArray[np.intp], float]:
+    """Rows, in random order, of the points [n,3] that are shown, one of each cell as large as a pixel is there; and the
+    pixels that a cell is wide, which are more where more than `most` points would be left.
+
+    The order is random, so that a part of them is spread over the scene as well.
+
+    sizes: of a pixel at each point [n], as `footprints` returns them. The sizes of cells are powers of two times a
+        length, so that they do not overlap: 0.7 to 1.4 pixels.
     """
     shown = np.flatnonzero(np.isfinite(sizes) & (sizes > 0.0))
+    random = np.random.default_rng(0)
     if not len(shown):
-        return shown
-    cells = np.exp2(np.round(np.log2(sizes[shown])))
-    rows: npt.NDArray[np.intp] = shown[in_cells(points[shown], cells)]
-    return rows
+        return shown, 1.0
+    shown = random.permutation(shown)
+    cells, pixels = np.exp2(np.round(np.log2(sizes[shown]))), 1.0
+    rows = in_cells(points[shown], cells)
+    while len(rows) > most:
+        pixels *= GROWTH
+        rows = in_cells(points[shown], pixels * cells)
+    return random.permutation(shown[rows]), pixels

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from splatmill_worker.scene import Camera, Projection
 
-PER_CELL = 4.0
+PER_CELL = 8.0
 """Points of a cell of the depth buffer, on average: with fewer, what lies behind shows through the front."""
 
 SLANT = 3.0
