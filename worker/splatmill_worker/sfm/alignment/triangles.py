@@ -9,6 +9,7 @@ surroundings of one triangle have to be in both clouds.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -47,7 +48,7 @@ class Palette:
     """
 
     counts: npt.NDArray[np.int64]
-    tree: object
+    tree: Any
 
     @staticmethod
     def of(scene: Cloud, scan: Cloud) -> Palette:
@@ -115,7 +116,7 @@ def _same_shape(
     rows = []
     for corner in corners:
         near = np.array(
-            palette.tree.query_ball_point(scene.colors[corner].astype(np.float64), ALIKE, p=np.inf)  # type: ignore[attr-defined]
+            palette.tree.query_ball_point(scene.colors[corner].astype(np.float64), ALIKE, p=np.inf)
         )
         rows.append(random.choice(near, CANDIDATES, replace=False) if len(near) > CANDIDATES else near)
     a, b, c = (scan.points[each] for each in rows)
