@@ -57,9 +57,10 @@ def document(rows: list[Row], references: list[Row], rows_at: Path, here: Path, 
 
 def budgets(timed: list[Row]) -> str:
     """A table of the result of each time budget, and whether runs ended in time and never got worse with more time."""
-    groups = grouped((row for row in whole(timed) if by_time(row)), "scene", "budget")
+    shown = [row for row in whole(timed) if by_time(row)]
+    groups = grouped(shown, "scene", "budget")
     seen = SEEN | {
-        name: head for name, head in LPIPS.items() if any(row.get(name) is not None for row in timed)
+        name: head for name, head in LPIPS.items() if any(row.get(name) is not None for row in shown)
     }
     quality_of = "|".join(["PSNR dB|SSIM", *seen.values()])
     head = (
