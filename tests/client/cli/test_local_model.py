@@ -177,6 +177,8 @@ def test_a_file_that_is_no_model(tmp_path: Path):
     ("arguments", "status", "sentence"),
     [
         (["render", "gone.ply"], Exit.usage, "There is no file gone.ply"),
+        (["render", "cameras.json"], Exit.usage, "cameras.json must end in one of .ply, .compressed.ply,"),
+        (["orbit", "cameras.json"], Exit.usage, "cameras.json must end in one of .ply, .compressed.ply,"),
         (["render", "ball.ply", "--camera", "2"], Exit.usage, "The model has 2 cameras, 0 to 1."),
         (["render", "ball.ply", "--camera", "c.json"], Exit.usage, "neither a file nor the number"),
         (["render", "ball.ply", "--view", "z.jpg"], Exit.usage, "no camera named 'z.jpg'; it has a.jpg"),

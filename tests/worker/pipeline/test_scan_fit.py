@@ -56,8 +56,12 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     )
 
 
+def quiet(stage: str, done: int, total: int, note: str) -> None:
+    """Ignore progress."""
+
+
 def aligned(scene: Scene, points: Float, colors: np.ndarray) -> scan_fit.Fit:
-    return scan_fit.aligned(scene, points, colors, None, 0, lambda: False)
+    return scan_fit.aligned(scene, points, colors, None, 0, quiet, lambda: False)
 
 
 def test_a_scan_of_the_scene_is_used(scene: Scene) -> None:
@@ -101,7 +105,7 @@ def test_a_file_without_colours_gets_those_of_the_photos_where_its_points_lie(sc
 def test_the_scene_keeps_its_tracks_and_the_scan_gets_some(scene: Scene, tmp_path: Path) -> None:
     points, colors = scanned()
     write_las(tmp_path / "scan.laz", TURN.points(points), colors)
-    found = with_given_points(scene, tmp_path / "scan.laz", TrainOptions(), lambda: False)
+    found = with_given_points(scene, tmp_path / "scan.laz", TrainOptions(), quiet, lambda: False)
     own, used = len(scene.points), found.facts["given_points_used"]
     assert len(found.points) == own + used
     assert found.facts["sparse_points"] == own
@@ -121,7 +125,7 @@ def test_a_format_in_metres_gives_the_scene_its_unit(
     points, colors = scanned()
     write_ply(tmp_path / "scan.ply", TURN.points(points), colors)
     monkeypatch.setattr("splatmill_worker.readers.scan.IN_METRES", (".ply",))
-    found = with_given_points(scene, tmp_path / "scan.ply", TrainOptions(), lambda: False)
+    found = with_given_points(scene, tmp_path / "scan.ply", TrainOptions(), quiet, lambda: False)
     assert found.frame is not None
     assert found.frame.unit == "metre"
     assert found.frame.reasons["unit"] == "Metres, because those of scan.ply are."
@@ -147,7 +151,7 @@ def test_a_file_that_determines_nothing_is_refused(points: Float, scene: Scene, 
     colors[0] = 0
     write_ply(tmp_path / "scan.ply", points, colors)
     with pytest.raises(Refusal) as refused:
-        with_given_points(scene, tmp_path / "scan.ply", TrainOptions(), lambda: False)
+        with_given_points(scene, tmp_path / "scan.ply", TrainOptions(), quiet, lambda: False)
     assert refused.value.code == "start_unusable"
     assert "do not fit the photos" in refused.value.message
 

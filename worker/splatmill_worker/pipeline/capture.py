@@ -86,7 +86,7 @@ def posed_scene(
             scene, workdir, seed=options.seed, on_progress=on_progress, cancelled=cancelled
         )
         if points is not None:
-            scene = given_points.with_given_points(scene, points, options, cancelled)
+            scene = given_points.with_given_points(scene, points, options, on_progress, cancelled)
         return replace(scene, warnings=(*scene.warnings, *one_place.warning(scene)))
     images = capture / "images"
     wanted = sfm.SfmOptions(
@@ -108,7 +108,7 @@ def posed_scene(
         None if options.scale is None else known_distance(options.scale),
     )
     if points is not None:
-        scene = given_points.with_given_points(scene, points, options, cancelled)
+        scene = given_points.with_given_points(scene, points, options, on_progress, cancelled)
     unread = [*posed.without_cameras(capture), *zipped.unused_cameras(capture, workdir, cancelled)]
     return replace(
         scene, warnings=(*names_remark(capture), *unread, *scene.warnings, *one_place.warning(scene))

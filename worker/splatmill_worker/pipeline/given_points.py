@@ -19,6 +19,7 @@ from splatmill_worker.pipeline import scan_fit
 from splatmill_worker.readers import scan
 from splatmill_worker.scene import PointViews, Scene
 from splatmill_worker.sfm.alignment import LIBRARY
+from splatmill_worker.sfm.callbacks import OnProgress
 from splatmill_worker.sfm.world.frame import in_metres
 from splatmill_worker.wording import plain
 
@@ -62,7 +63,7 @@ def points_path(capture: Path, options: TrainOptions) -> Path | None:
 
 
 def with_given_points(
-    scene: Scene, path: Path, options: TrainOptions, cancelled: Callable[[], bool]
+    scene: Scene, path: Path, options: TrainOptions, on_progress: OnProgress, cancelled: Callable[[], bool]
 ) -> Scene:
     """The scene with those points of a file that its photos show, beside its own: a scan has holes, and no sky.
 
@@ -82,7 +83,9 @@ def with_given_points(
         if find_spec(LIBRARY) is None:
             raise _lacking(path.name, LIBRARY, "cannot be aligned to the photos", "")
         where = "" if fit is None else f"As they lie: {fit.sentence} "
-        fit = scan_fit.aligned(scene, points, colors, options.image_size, options.seed, cancelled)
+        fit = scan_fit.aligned(
+            scene, points, colors, options.image_size, options.seed, on_progress, cancelled
+        )
         if not fit.fits:
             raise Refusal(
                 "start_unusable",

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from splatmill_worker.scene import Float, PointViews, Scene, View
 from splatmill_worker.sfm import posed
 from splatmill_worker.sfm.alignment import Unaligned, align
+from splatmill_worker.sfm.callbacks import OnProgress
 from splatmill_worker.splat.plan import capacity
 
 STARTED = 0.2
@@ -103,6 +104,7 @@ def aligned(
     colors: Colors,
     side: int | None,
     seed: int,
+    on_progress: OnProgress,
     cancelled: Callable[[], bool],
 ) -> Fit:
     """The points of a scan brought onto the scene's own by a similarity, if the photos then show their colours.
@@ -114,7 +116,15 @@ def aligned(
     """
     if (colors == colors[0]).all():
         return _none("They have no colours, by which they could be aligned to the points of the photos.")
-    found = align(points, colors, scene.points, scene.colors, seed=seed, cancelled=cancelled)
+    found = align(
+        points,
+        colors,
+        scene.points,
+        scene.colors,
+        seed=seed,
+        on_progress=on_progress,
+        cancelled=cancelled,
+    )
     if isinstance(found, Unaligned):
         return _none(f"They could not be aligned to the points of the photos: {found.reason}.")
     views = [view for view in scene.views if view.split != "test"]

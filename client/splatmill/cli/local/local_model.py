@@ -7,16 +7,24 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import typer
 
 from splatmill.cli.local.programs import exec_module, require
-from splatmill.schema.files.formats import format_of
+from splatmill.schema.files.formats import MODEL_FORMATS, format_of
 
 if TYPE_CHECKING:
     from splatmill.schema import CameraSpec, ModelCamera
 
 
 def is_local(model: str) -> bool:
-    """Return whether a command is given the path of a model file, and not the id of a model. Ids have no suffix."""
+    """Return whether a command is given the path of a model file, and not the id of a model. Ids have no suffix.
+
+    Raises BadParameter for a file that is there and has another suffix.
+    """
     model_format = format_of(model)
-    return model_format is not None and model_format.readable
+    if model_format is not None and model_format.readable:
+        return True
+    if Path(model).is_file():
+        known = ", ".join(suffix for suffix, form in MODEL_FORMATS.items() if form.readable)
+        raise typer.BadParameter(f"{model} must end in one of {known}.", param_hint="MODEL")
+    return False
 
 
 def local_cameras(model: Path) -> "list[ModelCamera]":

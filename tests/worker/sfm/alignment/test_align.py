@@ -42,11 +42,15 @@ def test_a_scan_in_any_unit_and_place_is_brought_back(seed: int, scale: float) -
     points, colors = scanned()
     truth = moved(seed, scale)
     own = still_life.scene()
-    found = align(truth.points(points), colors, own.points, own.colors)
+    told: list[tuple[str, int, int, str]] = []
+    found = align(
+        truth.points(points), colors, own.points, own.colors, on_progress=lambda *report: told.append(report)
+    )
     assert isinstance(found, Aligned)
-    assert (
-        error(found, truth, own.points) < 0.01
-    )  # points of the scene have a median distance of 1.6 from their middle
+    # Points of the scene have a median distance of 1.6 from their middle.
+    assert error(found, truth, own.points) < 0.01
+    assert [report[:2] for report in told] == [("alignment", done) for done in range(len(told))]
+    assert 0 < len(told) <= told[0][2]
     assert found.similarity.scale * scale == pytest.approx(1.0, rel=0.005)
     assert found.share > 0.5
     # Noise of 0.004 and the planes through points that are 0.03 apart.

@@ -12,7 +12,7 @@ from splatmill_worker.scene import Float, Similarity
 from splatmill_worker.sfm.alignment import icp, triangles
 from splatmill_worker.sfm.alignment.cells import spread
 from splatmill_worker.sfm.alignment.cloud import Cloud, degenerate
-from splatmill_worker.sfm.callbacks import stop_if
+from splatmill_worker.sfm.callbacks import OnProgress, stop_if
 
 SCENE_POINTS = 3_000
 """Points of the scene that are compared."""
@@ -80,6 +80,7 @@ def align(
     scene_colors: npt.NDArray[np.uint8],
     *,
     seed: int = 0,
+    on_progress: OnProgress = lambda stage, done, total, note: None,
     cancelled: Callable[[], bool] = lambda: False,
 ) -> Aligned | Unaligned:
     """Return the similarity that brings the points of a scan onto those of a scene, or why there is none.
@@ -89,6 +90,7 @@ def align(
     points: of the scan [n,3], in any unit, rotated and shifted; coordinates of millions lose nothing.
     colors: RGB of these [n,3].
     scene_points, scene_colors: of the scene [m,3].
+    on_progress: called with the stage "alignment" and numbers of triangles; most scans need few of the total.
 
     Raises ImportError without scipy, and Cancelled.
     """
@@ -109,13 +111,13 @@ def align(
     scene = Cloud.of(scene_points[rows] - about, scene_colors[rows])
     if not (scan.radius > 0.0 and scene.radius > 0.0):
         return Unaligned("more than half of the points lie at one place")
-    found = _search(scene, scan, random, cancelled)
+    found = _search(scene, scan, random, on_progress, cancelled)
     if found is None:
         return Unaligned("no part of it has the shape and the colours of a part of the scene")
     normals = icp.normals_of(scan)
     best = _finished(scene, scan, found, normals)
     mirrored = _finished(scene, *_mirrored(scene, scan, best.similarity), normals=None)
-    if mirrored.share > MIRRORED * best.share:
+    if mirrored.share > max(EVIDENT, MIRRORED * best.share):
         return Unaligned(
             f"its mirror image fits better, with {100 * mirrored.share:.0f} % of the points of the photos on it in "
             f"place of {100 * best.share:.0f} %. Exchange the sign of one axis"
@@ -155,7 +157,11 @@ def _near(scene: Cloud, scan: Cloud, similarity: Similarity) -> float:
 
 
 def _search(
-    scene: Cloud, scan: Cloud, random: np.random.Generator, cancelled: Callable[[], bool]
+    scene: Cloud,
+    scan: Cloud,
+    random: np.random.Generator,
+    on_progress: OnProgress,
+    cancelled: Callable[[], bool],
 ) -> Similarity | None:
     """The similarity that triangles of equal colours lead to, again and again; that with the most points otherwise."""
     clouds = [scan.thinned(count) for count in SPARSE]
@@ -164,6 +170,7 @@ def _search(
     best: list[tuple[float, int, Similarity]] = []
     for count in range(ROUNDS):
         stop_if(cancelled)
+        on_progress("alignment", count, ROUNDS, "places of the scan tried, at most")
         reached: list[tuple[float, Similarity]] = []
         scan, palette = clouds[count % len(clouds)], palettes[count % len(clouds)]
         for guess in triangles.guesses(scene, scan, palette, random):

@@ -47,9 +47,7 @@ class Pairs:
 def pairs(scene: Cloud, scan: Cloud, similarity: Similarity, limit: float) -> Pairs:
     """The points of the scene with a point of the scan, of the same colour, within `limit`."""
     moved = (scene.points - similarity.translation) @ similarity.rotation / similarity.scale
-    distances, near = scan.tree.query(
-        moved, k=NEIGHBOURS, distance_upper_bound=limit / similarity.scale, workers=-1
-    )
+    distances, near = scan.tree.query(moved, k=NEIGHBOURS, distance_upper_bound=limit / similarity.scale)
     alike = scan.alike(near, scene.colors)
     first = np.argmax(alike, axis=1)
     rows = np.flatnonzero(alike.any(axis=1))

@@ -11,6 +11,7 @@ const STAGES = new Map(Object.entries({
   matching: "Matching pairs of photos",
   mapping: "Placing cameras",
   stereo: "Adding points by stereo",
+  alignment: "Placing the scan",
   training: "Training",
   evaluation: "Comparing photos with the scene",
 }));
