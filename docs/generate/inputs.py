@@ -291,7 +291,8 @@ def _points() -> list[str]:
         wrong, or belong to other photos. It names another convention of axes or matrices in which they fit, if one
         does.""",
         """`--start scan.laz` names a file of points that are used beside all these. It may be a `.ply` or one of the
-        formats below, of which all but text need `pip install 'splatmill-worker[scans]'`:""",
+        formats below, of which all but text need `pip install 'splatmill-worker[scans]'`. The page takes one of these
+        that is dropped with the photos as such a file, unless it is left out there:""",
         table(["suffix", "format"], [[code(suffix), name] for suffix, name in POINT_FORMATS.items()]),
         f"""If cameras came with the photos, the points may be in their coordinates, and the photos judge them
         as above. If not, or if they do not fit so, points with colours are aligned by a similarity to the

@@ -49,6 +49,7 @@ from splatmill.schema import (
     WorkerInfo,
     describe_options,
 )
+from splatmill.schema.files.formats import POINT_FORMATS
 from splatmill.schema.files.other_pictures import OTHER_FOLDERS, UNUSED
 from splatmill_server.access.caller import Caller, Who
 from splatmill_server.access.permission import needs
@@ -108,6 +109,7 @@ def get_info(service: Shared, who: Who) -> Info:
             camera_lists=list(LISTS),
             large_cameras=list(LARGE),
             other_cameras={program: list(names) for program, names in OTHER_CAMERAS.items()},
+            points=list(POINT_FORMATS),
             example=EXAMPLE_FILE,
             min_photos=MIN_PHOTOS,
             min_photo_side=MIN_PHOTO_SIDE,

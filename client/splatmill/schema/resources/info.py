@@ -91,6 +91,10 @@ class Accepted(Response):
         default_factory=dict,
         description="Programs whose cameras are not read, with patterns of the names, in lower case, of their files.",
     )
+    points: list[str] = Field(
+        default_factory=list,
+        description="Suffixes of files of points that a training may start from, with the option `start`.",
+    )
     example: str | None = Field(
         default=None,
         description="Name of a file of any content among the images. Where it is the only file of a capture, a worker "

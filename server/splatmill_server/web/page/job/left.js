@@ -3,7 +3,7 @@
 import { get, send } from "../api.js";
 import { h } from "../dom.js";
 import { seconds } from "../format.js";
-import { suffix } from "../new/kinds.js";
+import { holdsCameras, suffix } from "../new/kinds.js";
 import { STATES } from "../job_states.js";
 import { notify } from "../shell.js";
 
@@ -18,7 +18,7 @@ const PASSES_IN = /** @type {Record<string, string[]>} */ ({ cameras: ["sfm"], t
 export async function estimateOf(job) {
   const [{ files }, { accepted }] = await Promise.all([get(`/v1/captures/${encodeURIComponent(job.capture)}`), get("/v1/info")]);
   const images = files.filter((/** @type {any} */ file) => file.role === "images").map((/** @type {any} */ file) => suffix(file.name));
-  const posed = files.some((/** @type {any} */ file) => file.role === "poses");
+  const posed = files.some((/** @type {any} */ file) => holdsCameras(file, accepted));
   const { stages } = await send("POST", "/v1/estimate", { photos: Math.max(images.length, 1), posed, options: job.options });
   // How many photos a zip, a video or the example holds is not known, and cameras take time for each.
   const counted = posed || images.every((/** @type {string} */ ending) => accepted.photos.includes(ending));

@@ -9,7 +9,7 @@ import { bytes, count, number } from "../format.js";
 /** Photos that are shown before somebody asks for all of them. */
 const SHOWN = 60;
 
-const KINDS = { photo: "photo", video: "video", archive: "zip archive", mask: "mask", pose: "cameras", ignored: "not used" };
+const KINDS = { photo: "photo", video: "video", archive: "zip archive", mask: "mask", pose: "cameras", scan: "points to start from", ignored: "not used" };
 
 export class Gallery {
   /**

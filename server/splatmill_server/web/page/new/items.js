@@ -1,7 +1,7 @@
 // The files that were given: which of them belong to the capture, under which names, and what is known of each.
 
 import { namesIn } from "./zip.js";
-import { fits, sort, suffix, withoutTop } from "./kinds.js";
+import { byCodePoint, holdsCameras, sort, suffix, withoutTop } from "./kinds.js";
 import { onMasks, places, remarks } from "./remarks.js";
 import { verdicts } from "./looking/verdicts.js";
 
@@ -12,7 +12,7 @@ import { verdicts } from "./looking/verdicts.js";
  * @property {File} file
  * @property {import("./kinds.js").Role | null} role null for a file that is not used
  * @property {string} name in the capture
- * @property {"photo" | "video" | "archive" | "mask" | "pose" | "ignored"} kind
+ * @property {"photo" | "video" | "archive" | "mask" | "pose" | "scan" | "ignored"} kind
  * @property {boolean} named whether it is a mask that a frame of a transforms file names
  * @property {boolean} left whether a person has left it out
  * @property {string | null} digest
@@ -133,6 +133,21 @@ export class Items {
       item.kind = this.kindOf(item);
       this.byPath.set(path, item);
     }
+    this.chooseScan();
+  }
+
+  /** Take the first file of points by its path, where there are photos, for one to start from. */
+  chooseScan() {
+    const [scan, ...others] = this.all.filter((item) => item.role === null && this.accepted.points.includes(suffix(item.path)))
+      .sort((one, other) => byCodePoint(one.path, other.path));
+    if (!scan || !this.all.some((item) => item.role === "images")) return;
+    Object.assign(scan, { role: "poses", name: scan.path.slice(scan.path.lastIndexOf("/") + 1).normalize("NFC"), kind: "scan" });
+    if (others.length) this.said.push(`One file of points is used. These are not: ${others.map(({ path }) => path).join(", ")}.`);
+  }
+
+  /** The name of the file of points that the training starts from, where there is one. */
+  get scan() {
+    return this.used.find((item) => item.kind === "scan")?.name ?? null;
   }
 
   /** @param {Item} item @returns {Item["kind"]} */
@@ -170,7 +185,8 @@ export class Items {
   /** Sentences about files that are not used, and about masks. */
   get remarks() {
     const used = this.used;
-    return [...(this.problem ? [this.problem] : []), ...this.said, ...onMasks(used.filter(({ kind }) => kind === "mask"), used.filter(({ kind }) => kind === "photo").map(({ name }) => name), this.accepted)];
+    const scan = this.scan ? [`The training starts from the points of ${this.scan} as well as from those of the photos.`] : [];
+    return [...(this.problem ? [this.problem] : []), ...scan, ...this.said, ...onMasks(used.filter(({ kind }) => kind === "mask"), used.filter(({ kind }) => kind === "photo").map(({ name }) => name), this.accepted)];
   }
 
   /** Read the list of an archive. @param {Item} item */
@@ -210,14 +226,4 @@ export class Items {
     }
     return { photos: known ? photos : null, exact: exact && known && photos > 0, posed };
   }
-}
-
-/**
- * Whether a file may hold cameras that are read.
- * @param {{role: string | null, name: string}} file
- * @param {import("./kinds.js").Accepted} accepted
- */
-function holdsCameras(file, accepted) {
-  const unread = Object.values(accepted.other_cameras).flat();
-  return file.role === "poses" && suffix(file.name) !== ".ply" && !unread.some((pattern) => fits(file.name, pattern));
 }

@@ -24,6 +24,7 @@ import { hasPhotosBeside, named } from "./documents.js";
  * @property {string[]} camera_lists patterns of the names of lists that belong to some of them
  * @property {Record<string, string[]>} other_cameras patterns of names, in lower case, by program
  * @property {string[]} large_cameras those of them whose files are not sent
+ * @property {string[]} points suffixes of files of points that a training may start from
  * @property {string} example name of the file of a capture whose photos a worker makes
  * @property {number} min_photos that cameras can be recovered from, at least
  * @property {number} min_photo_side pixels
@@ -72,6 +73,16 @@ export function suffix(path) {
   const base = path.slice(path.lastIndexOf("/") + 1);
   const dot = base.lastIndexOf(".");
   return dot > 0 ? base.slice(dot).toLowerCase() : "";
+}
+
+/**
+ * Whether a file of a capture may hold cameras that are read. One that a training starts from lies among them, too.
+ * @param {{role: string | null, name: string}} file
+ * @param {Accepted} accepted
+ */
+export function holdsCameras(file, accepted) {
+  if (file.role !== "poses" || [".ply", ...accepted.points].includes(suffix(file.name))) return false;
+  return !Object.values(accepted.other_cameras).flat().some((pattern) => fits(file.name, pattern));
 }
 
 /**
@@ -343,7 +354,7 @@ export function fits(path, pattern) {
 }
 
 /** The order of Python's strings. @param {string} one @param {string} other */
-function byCodePoint(one, other) {
+export function byCodePoint(one, other) {
   const [left, right] = [[...one], [...other]];
   for (let i = 0; i < Math.min(left.length, right.length); i++) {
     const difference = /** @type {number} */ (left[i].codePointAt(0)) - /** @type {number} */ (right[i].codePointAt(0));

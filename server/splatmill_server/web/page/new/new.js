@@ -218,6 +218,7 @@ function estimateSoon() {
 /** The job that would be started, as the server estimates it; its photos are null where they cannot be counted here. */
 function job() {
   const values = form.values();
+  if (items.scan) values.start ??= items.scan;
   const { photos, exact, posed } = items.size(start.held, Number(values.max_video_frames) || options.find((/** @type {any} */ one) => one.name === "max_video_frames").default);
   return { photos, body: { photos: Math.max(1, photos ?? 1), exact, posed, capture: start.capture, options: values } };
 }

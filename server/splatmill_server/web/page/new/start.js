@@ -19,7 +19,7 @@ export class Start {
    * @param {object} on
    * @param {() => void} on.redraw
    * @param {(problem: Error | null) => void} on.problem
-   * @param {() => unknown} on.job the job that would be started, as the server estimates it
+   * @param {() => {options: Record<string, unknown>}} on.job the job that would be started, as the server estimates it
    */
   constructor(items, form, on) {
     this.items = items;
@@ -210,7 +210,7 @@ export class Start {
 
   async createJob() {
     this.say("Starting the job");
-    const body = { capture: this.capture, name: this.name.value.trim() || null, options: this.form.values() };
+    const body = { capture: this.capture, name: this.name.value.trim() || null, options: this.on.job().options };
     const text = JSON.stringify(body);
     this.job = this.upload?.job ?? this.job;
     if (this.job.body !== text) this.job = { key: `page-${unique()}`, body: text };
