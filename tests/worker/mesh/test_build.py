@@ -16,7 +16,7 @@ import torch
 from splatmill.schema import Progress
 from splatmill_worker.mesh import build as building
 from splatmill_worker.mesh.build import NoSurface, Wanted, build, chosen
-from splatmill_worker.mesh.depths import NORMAL_UNIT, View, confirmed
+from splatmill_worker.mesh.depths import View, confirmed
 from splatmill_worker.mesh.poisson import TooFine
 from splatmill_worker.scene import Camera
 from splatmill_worker.splat.gaussians import Gaussians
@@ -57,9 +57,7 @@ def test_a_ball_becomes_a_round_mesh_with_its_colours(views: list[View]) -> None
     stages: list[Progress] = []
     built = build(ball(), cameras(), Wanted(20_000), told=stages.append, views=views)
     radii = np.linalg.norm(built.mesh.vertices, axis=1)
-    # Two depths agree within 1 % of 3.3, which is 1.9 voxels; at the rim of a view both may be wrong by as much.
-    assert np.abs(radii - 1.0).max() < 4 * built.voxel
-    assert np.quantile(np.abs(radii - 1.0), 0.95) < 2 * built.voxel
+    assert np.abs(radii - 1.0).max() < 2 * built.voxel
     assert abs(np.median(radii) - 1.0) < 0.5 * built.voxel
     assert ((built.mesh.normals() * built.mesh.vertices).sum(1) > 0.5).mean() > 0.99
     colors = built.mesh.colors
@@ -70,16 +68,6 @@ def test_a_ball_becomes_a_round_mesh_with_its_colours(views: list[View]) -> None
     assert built.views == 12
     assert built.extracted >= len(built.mesh.faces) > 2000
     assert stages[-1].stage == "colouring the surface"
-
-
-def test_the_normals_of_the_views_are_those_of_the_ball(views: list[View]) -> None:
-    for view in views:
-        points, numbers = view.points()
-        normals = view.normal.view(-1, 3)[numbers].float()
-        assert float((normals.norm(dim=1) / NORMAL_UNIT - 1.0).abs().max()) < 0.01
-        away = torch.nn.functional.cosine_similarity(normals, points)  # of a ball around the origin
-        # Discs of 0.05 blend over a tenth of the radius, and bend by as much.
-        assert float(away.quantile(0.05)) > 0.98
 
 
 def test_the_box_and_the_number_of_triangles_are_kept(views: list[View]) -> None:
@@ -94,8 +82,7 @@ def test_far_from_the_origin_the_mesh_is_as_good() -> None:
     shift = (1000.0, -2000.0, 500.0)
     built = build(ball(shift), cameras(shift=shift), Wanted(20_000))
     radii = np.linalg.norm(built.mesh.vertices.astype(np.float64) - shift, axis=1)
-    assert np.abs(radii - 1.0).max() < 4 * built.voxel
-    assert np.quantile(np.abs(radii - 1.0), 0.95) < 2 * built.voxel
+    assert np.abs(radii - 1.0).max() < 2.5 * built.voxel
 
 
 def test_a_depth_that_no_other_view_confirms_is_left_out(views: list[View]) -> None:

@@ -43,10 +43,7 @@ def views() -> list[View]:
         x = camera.center[0] + depth * rays[:, 0]
         red = (np.floor((x + 1) / 2 * STRIPES) % 2 == 0)[:, None]
         color = np.where(red, [[200, 40, 30]], [[30, 160, 60]]).reshape(256, 256, 3).astype(np.uint8)
-        facing = torch.tensor([0, 0, 127], dtype=torch.int8).expand(256, 256, 3)
-        seen.append(
-            View(camera, torch.from_numpy(color), torch.from_numpy(depth.reshape(256, 256)).float(), facing)
-        )
+        seen.append(View(camera, torch.from_numpy(color), torch.from_numpy(depth.reshape(256, 256)).float()))
     return seen
 
 

@@ -28,7 +28,7 @@ MOST_VIEWS = 200
 """Cameras that are used; of more, an even choice."""
 
 MOST_PIXELS = 120_000_000
-"""Pixels of all views together, at ten bytes each; with more, all views are smaller."""
+"""Pixels of all views together, at seven bytes each; with more, all views are smaller."""
 
 FOOTPRINT = 1.0
 """Side of a voxel in widths of a pixel at the median depth."""

@@ -1,9 +1,9 @@
-"""Depth and normals of a model in many views, kept where other views confirm the depth."""
+"""Depth of a model in many views, kept where other views confirm it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -31,10 +31,6 @@ GRAZING = 0.1
 """Smallest cosine between a surface's normal and the ray to it at which its depth is kept."""
 
 
-NORMAL_UNIT = 127.0
-"""Length of a stored normal: bytes hold its direction to within 0.4 degrees."""
-
-
 @dataclass(frozen=True)
 class View:
     """What one camera sees, on the CPU.
@@ -42,13 +38,11 @@ class View:
     camera: it.
     color: uint8 [H, W, 3].
     depth: [H, W] camera z, world units; 0 where none is known.
-    normal: int8 [H, W, 3], NORMAL_UNIT times the unit normals of the surface in the world, which face the camera.
     """
 
     camera: Camera
     color: Tensor
     depth: Tensor
-    normal: Tensor
 
     def pixels(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Column and row int64 [n] of world points [n, 3], and their depths [n], which are 0 of those not in view."""
@@ -99,8 +93,7 @@ def views_of(
         towards = -torch.nn.functional.normalize(rays, dim=-1) @ viewmat[:3, :3]
         facing = (towards * normal).sum(-1) > GRAZING
         color = (seen.color.cpu().clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
-        stored = (NORMAL_UNIT * normal).round().to(torch.int8)
-        views.append(View(camera, color, torch.where(facing, depth, 0.0), stored))
+        views.append(View(camera, color, torch.where(facing, depth, 0.0)))
         told(index + 1)
     return views
 
@@ -118,7 +111,7 @@ def confirmed(views: Sequence[View]) -> list[View]:
             votes += (z > 0) & (difference < AGREEMENT * z)
         depth = torch.zeros_like(view.depth)
         depth.view(-1)[numbers] = torch.where(votes >= needed, view.depth.view(-1)[numbers], 0.0)
-        kept.append(replace(view, depth=depth))
+        kept.append(View(view.camera, view.color, depth))
     return kept
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from splatmill_worker.mesh.depths import View
+from splatmill_worker.mesh.depths import GRAZING, View
 
 Corners = tuple[tuple[float, float, float], tuple[float, float, float]]
 """The lower and the upper corner of a box."""
@@ -50,7 +50,7 @@ class Samples:
 
 
 def samples_of(views: Sequence[View], region: Region) -> Samples:
-    """The pixels of all views whose depth is known, in the region; MOST of them at most."""
+    """The pixels of all views whose depth and whose neighbours' is known, in the region; MOST of them at most."""
     pixels = sum(int(region.of(view).sum()) for view in views)
     share = min(1.0, MOST / max(1, pixels))
     parts = [_of_view(view, region, share) for view in views]
@@ -60,7 +60,16 @@ def samples_of(views: Sequence[View], region: Region) -> Samples:
 
 def _of_view(view: View, region: Region, share: float) -> tuple[Tensor, Tensor]:
     points, numbers = view.points()
-    chosen = region.of(view) & (numbers * _MIXER % 2**32 < share * 2**32)
-    # Not the slopes of the depths: those are rough, and unknown beside holes (decisions: mesh-normals).
-    normal = view.normal.view(-1, 3)[numbers[chosen]].float()
-    return points[chosen], torch.nn.functional.normalize(normal, dim=1)
+    whole = torch.full((view.depth.numel(), 3), torch.nan)
+    whole[numbers] = points
+    grid = whole.view(*view.depth.shape, 3)
+    across, down = grid.roll(-1, 1) - grid.roll(1, 1), grid.roll(-1, 0) - grid.roll(1, 0)
+    # Not the normals of the Gaussians: that of a round one faces each camera (decisions: mesh-normals).
+    # Rows run down and columns to the right, so that the product points away from the camera.
+    normal = -torch.nn.functional.normalize(torch.linalg.cross(across, down), dim=-1).view(-1, 3)[numbers]
+    towards = torch.nn.functional.normalize(torch.as_tensor(view.camera.center).float() - points, dim=1)
+    # NaN beside unknown depths. At the edge of a thing, the product is that of the gap behind it.
+    good = (normal * towards).sum(1) > GRAZING
+    good &= region.of(view)
+    good &= numbers * _MIXER % 2**32 < share * 2**32
+    return points[good], normal[good]

@@ -90,37 +90,22 @@ def test_the_pairs_that_have_no_plan_are_refused_by_the_schema_alone(monkeypatch
     monkeypatch.setattr(splatmill.schema.options, "check_conflicts", lambda options: None)
     found = set()
     for number, given in enumerate(PAIRS):
-        if {"scale", "start"} == set(given):
-            continue  # refused with the cameras, before there are facts
         assert refused[number] == (set(given) if refused_by_plan(given) else set()), given
         found |= {frozenset(refused[number])}
-    assert found - {frozenset()} == {frozenset(each.names) for each in CONFLICTS} - {
-        frozenset({"scale", "start"})
-    }
+    assert found - {frozenset()} == {frozenset(each.names) for each in CONFLICTS}
 
 
-@pytest.mark.parametrize("start", [*MODELS, *POINTS])
-def test_a_scale_stands_beside_models_and_not_beside_points(start: str) -> None:
-    given = {"scale": "a.jpg b.jpg 2m", "start": start}
-    assert excluded(given) == (set(given) if start in POINTS else set())
-
-
-@pytest.mark.usefixtures("unchecked")
-@pytest.mark.parametrize("posed", [True, False])
 @pytest.mark.parametrize("start", POINTS)
-def test_points_and_a_scale_are_refused_with_cameras_and_without(
-    start: str, posed: bool, tmp_path: Path
-) -> None:
+def test_a_scale_is_refused_with_cameras_whatever_the_start(start: str, tmp_path: Path) -> None:
     capture = tmp_path / "capture"
     (capture / "images").mkdir(parents=True)
     (capture / "poses").mkdir()
     (capture / "poses" / start).touch()
-    if posed:
-        (capture / "poses" / "transforms.json").write_text('{"frames": []}')
+    (capture / "poses" / "transforms.json").write_text('{"frames": []}')
     options = TrainOptions.model_validate({"scale": "a.jpg b.jpg 2m", "start": start})
     with pytest.raises(Refusal) as refused:
         posed_scene(capture, tmp_path / "work", options, lambda *_: None, lambda: False)
-    assert refused.value.code == ("option_out_of_range" if posed else "start_unusable")
+    assert refused.value.code == "option_out_of_range"
 
 
 @pytest.mark.parametrize("conflict", CONFLICTS, ids=lambda conflict: "-".join(conflict.names))
