@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
 
@@ -202,41 +203,43 @@ def peers(rows: list[Row]) -> str:
 
 def without_points(rows: list[Row]) -> str:
     """A table of captures that have cameras and no points, each beside the same capture with its points."""
-    ours = whole(once([row for row in rows if row["kind"] == "run" and row["config"] == DEFAULT]))
-    groups = grouped(ours, "scene", "budget", "code")
-    last = {(scene, budget): code for scene, budget, code in groups if scene in bare.WITH_POINTS}
     lines = []
-    for (scene, budget), code in last.items():
-        having = bare.WITH_POINTS[scene]
-        without, given = groups[scene, budget, code], groups.get((having, budget, code))
-        if given:
-            mine, theirs = (Spread.of(row["psnr"] for row in group) for group in (without, given))
-            loss = f"{mine.median - theirs.median:+.2f}"
-            lines.append([scene, budget, len(without), mine.text(2), having, theirs.text(2), loss])
+    for scene, budget, without, having, given in _beside(rows, bare.WITH_POINTS):
+        mine, theirs = (Spread.of(row["psnr"] for row in group) for group in (without, given))
+        loss = f"{mine.median - theirs.median:+.2f}"
+        lines.append([scene, budget, len(without), mine.text(2), having, theirs.text(2), loss])
     head = "cameras alone|budget|seeds|PSNR dB|the same with points|PSNR dB|difference, dB"
     return table(head, lines) if lines else ""
 
 
 def with_scan(rows: list[Row]) -> str:
     """A table of captures that come with a scan, each beside the same photos alone."""
-    ours = whole(once([row for row in rows if row["kind"] == "run" and row["config"] == DEFAULT]))
-    groups = grouped(ours, "scene", "budget", "code")
-    last = {(scene, budget): code for scene, budget, code in groups if scene in scanned.SCENES}
     lines = []
-    for (scene, budget), code in last.items():
-        alone = scanned.WITHOUT_SCAN[scene]
-        having, photos = groups[scene, budget, code], groups.get((alone, budget, code))
-        if photos:
-            mine, theirs = (Spread.of(row["psnr"] for row in group) for group in (having, photos))
-            spent = [
-                f"{Spread.of(row['wall_seconds'] for row in group).median:.0f}" for group in (having, photos)
-            ]
-            gain = f"{mine.median - theirs.median:+.2f}"
-            lines.append(
-                [scene, budget, len(having), mine.text(2), spent[0], alone, theirs.text(2), spent[1], gain]
-            )
+    for scene, budget, having, alone, photos in _beside(rows, scanned.WITHOUT_SCAN):
+        mine, theirs = (Spread.of(row["psnr"] for row in group) for group in (having, photos))
+        spent = [
+            f"{Spread.of(row['wall_seconds'] for row in group).median:.0f}" for group in (having, photos)
+        ]
+        gain = f"{mine.median - theirs.median:+.2f}"
+        lines.append(
+            [scene, budget, len(having), mine.text(2), spent[0], alone, theirs.text(2), spent[1], gain]
+        )
     head = "with a scan|budget|seeds|PSNR dB|all wall s|photos alone|PSNR dB|all wall s|difference, dB"
     return table(head, lines) if lines else ""
+
+
+def _beside(
+    rows: list[Row], others: Mapping[str, str]
+) -> Iterator[tuple[str, str, list[Row], str, list[Row]]]:
+    """Each scene of `others` that has one of the same budget and code beside it: scene, budget, its rows, the other
+    scene and the rows of that. The last code counts."""
+    ours = whole(once([row for row in rows if row["kind"] == "run" and row["config"] == DEFAULT]))
+    groups = grouped(ours, "scene", "budget", "code")
+    last = {(scene, budget): code for scene, budget, code in groups if scene in others}
+    for (scene, budget), code in last.items():
+        other = groups.get((others[scene], budget, code))
+        if other:
+            yield scene, budget, groups[scene, budget, code], others[scene], other
 
 
 def found(rows: list[Row]) -> str:
