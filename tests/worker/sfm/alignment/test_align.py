@@ -154,6 +154,16 @@ def test_the_same_scan_gives_the_same_similarity() -> None:
     np.testing.assert_array_equal(one.similarity.matrix, other.similarity.matrix)
 
 
+def test_places_that_fit_equally_well_are_told_apart() -> None:
+    """Colours exchanged: no place is right, and many hold the same few points of the scene."""
+    points, colors = (each[::40] for each in scanned())
+    own = still_life.scene()
+    exchanged = np.random.default_rng(1).permutation(len(colors))
+    found = align(points, colors[exchanged], own.points[::20], own.colors[::20])
+    assert isinstance(found, Aligned)
+    assert found.share < 0.5
+
+
 def test_cells_hold_one_point_each() -> None:
     points = np.array([[0.0, 0, 0], [0.4, 0, 0], [0.9, 0, 0], [1.1, 0, 0], [1.1, 0, 0]])
     assert in_cells(points, 1.0).tolist() == [0, 3]

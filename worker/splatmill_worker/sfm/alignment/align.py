@@ -66,6 +66,21 @@ class Aligned:
     residual: float
 
 
+@dataclass(frozen=True, eq=False)
+class _Place:
+    """A similarity that triangles led to.
+
+    score: share of the points of the scene that the scan has under it, above chance.
+    votes: number of triangles.
+    held: points of each thinned scan that the scene has under it [n,3].
+    """
+
+    score: float
+    votes: int
+    similarity: Similarity
+    held: tuple[Float, ...]
+
+
 @dataclass(frozen=True)
 class Unaligned:
     """No similarity was found; `reason` is the end of a sentence."""
@@ -167,32 +182,34 @@ def _search(
     clouds = [scan.thinned(count) for count in SPARSE]
     palettes = [triangles.Palette.of(scene, each) for each in clouds]
     exchanged = replace(scene, colors=scene.colors[random.permutation(len(scene.colors))])
-    best: list[tuple[float, int, Similarity]] = []
+    best: list[_Place] = []
     for count in range(ROUNDS):
         stop_if(cancelled)
         on_progress("alignment", count, ROUNDS, "places of the scan tried, at most")
         reached: list[tuple[float, Similarity]] = []
-        scan, palette = clouds[count % len(clouds)], palettes[count % len(clouds)]
+        turn = count % len(clouds)
+        scan, palette = clouds[turn], palettes[turn]
         for guess in triangles.guesses(scene, scan, palette, random):
             moved = icp.refined(scene, scan, guess, 4.0 * scan.spacing * guess.scale, 8)
             reached.append((_score(scene, exchanged, scan, moved), moved))
         if not reached:
             continue
         score, similarity = max(reached, key=lambda each: each[0])
-        if score > 0.5 * max((entry[0] for entry in best), default=0.0):
+        if score > 0.5 * max((place.score for place in best), default=0.0):
             limit = 2.0 * _near(scene, scan, similarity)
             similarity = icp.refined(scene, scan, similarity, limit, 12)
             score = _score(scene, exchanged, scan, similarity)
-        same = [entry for entry in best if _same(scene, scan, entry[2], similarity)]
-        best = [entry for entry in best if entry not in same]
-        top = max([(score, similarity), *((entry[0], entry[2]) for entry in same)], key=lambda each: each[0])
-        best.append((top[0], 1 + sum(entry[1] for entry in same), top[1]))
-        best.sort(key=lambda entry: -entry[0])
+        same = [place for place in best if _same(place.similarity, similarity, place.held[turn])]
+        best = [place for place in best if place not in same]
+        held = tuple(_held(scene, cloud, similarity) for cloud in clouds)
+        top = max([_Place(score, 1, similarity, held), *same], key=lambda place: place.score)
+        best.append(replace(top, votes=1 + sum(place.votes for place in same)))
+        best.sort(key=lambda place: -place.score)
         best = best[:KEPT]
-        score, votes, _ = best[0]
+        votes, score = best[0].votes, best[0].score
         if votes >= MANY_VOTES or (votes >= VOTES and score > EVIDENT):
             break
-    return best[0][2] if best and best[0][0] > 0.0 else None
+    return best[0].similarity if best and best[0].score > 0.0 else None
 
 
 def _score(scene: Cloud, exchanged: Cloud, scan: Cloud, similarity: Similarity) -> float:
@@ -202,11 +219,16 @@ def _score(scene: Cloud, exchanged: Cloud, scan: Cloud, similarity: Similarity) 
     return (own - other) / len(scene.points)
 
 
-def _same(scene: Cloud, scan: Cloud, one: Similarity, other: Similarity) -> bool:
-    """Whether two similarities place the points of the scan that the scene has at the same places."""
-    partners = icp.pairs(scene, scan, one, _near(scene, scan, one)).partners
-    if not len(partners):
+def _held(scene: Cloud, scan: Cloud, similarity: Similarity) -> Float:
+    """The points of the scan [n,3] that the scene has under a similarity."""
+    held: Float = scan.points[icp.pairs(scene, scan, similarity, _near(scene, scan, similarity)).partners]
+    return held
+
+
+def _same(one: Similarity, other: Similarity, held: Float) -> bool:
+    """Whether two similarities place the points `held` [n,3] of the scan, which the scene has, at the same places."""
+    if not len(held):
         return False
-    first, second = one.points(scan.points[partners]), other.points(scan.points[partners])
+    first, second = one.points(held), other.points(held)
     radius = float(np.median(np.linalg.norm(first - np.median(first, axis=0), axis=1)))
     return bool(np.median(np.linalg.norm(first - second, axis=1)) < SAME * radius)
