@@ -9,6 +9,7 @@ is taken back.
 import gc
 import os
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from hypothesis import settings
@@ -37,11 +38,29 @@ def pytest_collection_finish() -> None:
     gc.enable()
 
 
+FOLDER = Path(__file__).parent
+
+LONGEST = (
+    "service/test_kills.py",
+    "docs/test_blocks.py",
+    "packaging/test_wheels.py",
+    "inputs/test_video_variants.py",
+    "client/cli/test_unfinished.py",
+    "worker/pipeline/test_decision_pairs.py",
+    "hostile/test_hostile.py",
+    "service/test_soak.py",
+    "service/test_up.py",
+    "bench/test_train.py",
+)
+"""Files that take over a minute by themselves, the longest first; the first mostly waits."""
+
+
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files with slow tests first, so that no process is left alone with one of them at the end."""
+    """The longest files first, then those with slow tests, so that no process is left alone with one at the end."""
     slow = {item.path for item in items if item.get_closest_marker("slow")}
-    items.sort(key=lambda item: item.path not in slow)
+    first = {FOLDER / name: place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: (first.get(item.path, len(first)), item.path not in slow))
 
 
 @pytest.fixture(autouse=True)
