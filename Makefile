@@ -73,7 +73,7 @@ screenshots: $(VENV)/.installed-dev ## make the documentation's pictures of the 
 	$(BIN)/python docs/screenshots.py
 
 walk: $(VENV)/.installed-dev ## walk the pages as a new user, at three sizes and in two themes; pictures in demo/walk (some minutes)
-	PYTHONPATH=server $(BIN)/python -m tests.support.first_hour demo/walk
+	PYTHONPATH=server $(BIN)/python -m tests.support.page.first_hour demo/walk
 
 pictures: $(VENV)/.installed ## make the documentation's pictures of what photos do to a model (some minutes)
 	$(BIN)/python docs/pictures.py

@@ -9,6 +9,7 @@ import ast
 import re
 import subprocess
 import sys
+from collections import Counter
 from graphlib import TopologicalSorter
 from importlib import import_module
 from pathlib import Path
@@ -55,6 +56,26 @@ def test_no_import_of_the_web_page_goes_in_a_circle():
 def test_no_file_is_over_600_lines():
     long = {str(p.relative_to(ROOT)): n for p in sources() if (n := len(p.read_text().splitlines())) > 600}
     assert not long
+
+
+MOST_FILES = 20
+"""Files of a folder."""
+
+FULLER = {
+    "docs": 30,
+    "server/bench": 24,
+    "server/splatmill_server/web/page": 21,
+    "worker/bench": 40,
+}
+"""Folders with more files than that, and how many at most. No folder is added, and no number grows."""
+
+
+def test_no_folder_has_over_20_files():
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    counts = Counter(Path(line).parent.as_posix() for line in listed.splitlines())
+    full = {folder: count for folder, count in counts.items() if count > MOST_FILES}
+    assert not {folder: count for folder, count in full.items() if count > FULLER.get(folder, MOST_FILES)}
+    assert full.keys() == FULLER.keys(), "a folder that has no more files than 20 leaves the list"
 
 
 @pytest.mark.parametrize("backend", ["reference", "cpu", "gpu"])

@@ -1,6 +1,7 @@
 """Proves `bench worst`: its scenes reach what they are for, it finds a planted fault, rows give back the very input.
 
-Not proven here: the inputs found, which are in worker/bench/results and pinned in tests/kernels/test_worst_cases.py.
+Not proven here: the inputs found, which are in worker/bench/results and pinned in
+tests/kernels/proofs/test_worst_cases.py.
 """
 
 from __future__ import annotations

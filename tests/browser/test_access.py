@@ -9,7 +9,7 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from tests.browser.conftest import Open, SmallModel
-from tests.support.axe import violations
+from tests.support.page.axe import violations
 from tests.support.up import Up
 
 COUNT = """[...document.querySelectorAll("a[href], button, input, select, [tabindex='0']")]

@@ -13,7 +13,7 @@ from playwright.sync_api import Locator, Page, expect
 from splatmill.schema.resources.jobs.labels import MOST_TAGS
 from tests.browser.conftest import Open, SmallModel
 from tests.browser.test_lists import cancelled_jobs
-from tests.support.axe import violations
+from tests.support.page.axe import violations
 from tests.support.up import Up
 
 PHONE = {"width": 390, "height": 780}

@@ -24,8 +24,8 @@ from splatmill_server.up import lan
 from splatmill_server.up.certificate import certificate
 from splatmill_server.up.folder import UpError
 from tests.browser.conftest import Open
-from tests.support.axe import violations
-from tests.support.qr_code import read_code
+from tests.support.page.axe import violations
+from tests.support.page.qr_code import read_code
 from tests.support.up import Up
 
 

@@ -19,7 +19,7 @@ from playwright.sync_api import Page, expect
 from splatmill_server.base.root_path import HEADER
 from tests.browser.conftest import Open, SmallModel
 from tests.support import still_life
-from tests.support.path_proxy import path_proxy
+from tests.support.servers.path_proxy import path_proxy
 from tests.support.up import Up
 
 LONG = 60_000

@@ -15,9 +15,9 @@ from splatmill.backplane.connection import connect
 from splatmill_server.base.root_path import HEADER
 from splatmill_server.base.settings import Settings
 from tests.browser.conftest import Open
-from tests.support.path_proxy import path_proxy
 from tests.support.redis_server import empty_redis
 from tests.support.served_app import ServedApp, served_app
+from tests.support.servers.path_proxy import path_proxy
 
 
 @pytest.fixture(scope="module")

@@ -26,7 +26,7 @@ from splatmill.schema import Event, Job, JobState, Problem, StateEvent
 from splatmill_server.app import create_app
 from splatmill_server.base.settings import Settings
 from tests.support.redis_server import empty_redis
-from tests.support.scripted_server import Reply, ScriptedServer, scripted_server
+from tests.support.servers.scripted_server import Reply, ScriptedServer, scripted_server
 
 
 @pytest.fixture

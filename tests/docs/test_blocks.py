@@ -1,9 +1,9 @@
 """Every code block of the README and of the documentation runs as it is written.
 
 Shell and Python blocks run in order, page by page, in a folder with photos of the still life, against a real service
-where they talk to one. What they print must have the shape of the `output` block that follows. `tests.support.reader`
-lists what is made smaller before a block runs. Blocks that cannot run here carry a mark with the reason, and the test
-prints and counts them.
+where they talk to one. What they print must have the shape of the `output` block that follows.
+`tests.support.documentation.reader` lists what is made smaller before a block runs. Blocks that cannot run here carry a
+mark with the reason, and the test prints and counts them.
 
 Does not prove the figures in the output, nor that prose about a block is true.
 """
@@ -17,10 +17,10 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.markdown import Block, blocks
+from tests.support.documentation.markdown import Block, blocks
+from tests.support.documentation.reader import Beginning, Reader, Services
+from tests.support.documentation.shapes import mismatch
 from tests.support.paths import ROOT
-from tests.support.reader import Beginning, Reader, Services
-from tests.support.shapes import mismatch
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 RUN = {"bash", "python"}

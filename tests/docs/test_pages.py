@@ -18,7 +18,7 @@ from splatmill.cli.app import COMMANDS, app
 from splatmill.schema import PROBLEMS, describe_options
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.plan.reasons import BY_OPTION
-from tests.support.markdown import blocks, without_blocks
+from tests.support.documentation.markdown import blocks, without_blocks
 from tests.support.paths import ROOT
 
 PAGES = [

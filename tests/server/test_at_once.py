@@ -18,8 +18,8 @@ from splatmill.backplane.storage.storage import StorageError
 from splatmill_server import shares, webhooks
 from splatmill_server.background import imports, orbits
 from splatmill_server.base.metrics import Metrics
-from tests.support.scripted_server import Reply, ScriptedServer, scripted_server
 from tests.support.served_app import Serve, ServedApp, store_model
+from tests.support.servers.scripted_server import Reply, ScriptedServer, scripted_server
 
 pytestmark = pytest.mark.slow
 

@@ -24,8 +24,8 @@ from splatmill.schema import Job, JobState, Problem, StateEvent
 from splatmill_server.background import deliveries
 from splatmill_server.base.leases import exclusive
 from splatmill_server.base.problems import ProblemError
-from tests.support.scripted_server import Reply, ScriptedServer, Seen, scripted_server
 from tests.support.served_app import Serve, ServedApp, problem, stored
+from tests.support.servers.scripted_server import Reply, ScriptedServer, Seen, scripted_server
 from tests.support.waiting import wait_for
 
 

@@ -1,6 +1,7 @@
 """What the service's tests run against: a real `splatmill up` (tests/support/up.py), for all of them or for one.
 
-Only the pipeline is a stand-in (tests/support/standin.py), so that a test can stop, crash or slow it at a chosen step.
+Only the pipeline is a stand-in (tests/support/servers/standin.py), so that a test can stop, crash or slow it at a
+chosen step.
 """
 
 from collections.abc import Iterator

@@ -1,8 +1,8 @@
 """A short soak: a fault of each main kind against the whole service, which then must have lost nothing.
 
 The jobs are the engine's, on eleven small photos. `make soak` has hundreds of faults. That its checks find what they
-look for is proven in tests/server/test_soak_checks.py and test_soak_processes.py. Not proven here: faults of S3, and
-that hundreds are survived.
+look for is proven in tests/server/bench/test_soak_checks.py and test_soak_processes.py. Not proven here: faults of S3,
+and that hundreds are survived.
 """
 
 import pytest

@@ -21,8 +21,8 @@ from tests.support.waiting import wait_for
 
 FINAL = {"succeeded", "failed", "cancelled"}
 
-STANDIN = {"SPLATMILL_PIPELINE": "tests.support.standin", "PYTHONPATH": str(ROOT)}
-"""The environment of a worker that runs tests/support/standin.py instead of the engine."""
+STANDIN = {"SPLATMILL_PIPELINE": "tests.support.servers.standin", "PYTHONPATH": str(ROOT)}
+"""The environment of a worker that runs tests/support/servers/standin.py instead of the engine."""
 
 
 class Up:

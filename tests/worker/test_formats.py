@@ -9,7 +9,7 @@ from splatmill.schema import Job, ModelCameras, Report
 from splatmill_worker.splat.formats import ply
 from splatmill_worker.splat.plan.plan_file import read_plan
 from splatmill_worker.splat.train import checkpoint
-from tests.support.formats import V1, job_ids
+from tests.support.stored.formats import V1, job_ids
 
 MODEL = V1 / "storage" / "models" / job_ids()["succeeded"]
 

@@ -24,8 +24,8 @@ from splatmill_worker.errors import UnusablePicture
 from splatmill_worker.images.decoding import decoders
 from splatmill_worker.images.decoding.decoder import program_files
 from splatmill_worker.images.decoding.decoders import Decoders, confined
-from tests.support import forbidden_acts
-from tests.support.acting import acts
+from tests.support.decoding import forbidden_acts
+from tests.support.decoding.acting import acts
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="Landlock and seccomp are parts of Linux")
 

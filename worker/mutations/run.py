@@ -20,11 +20,12 @@ import argparse
 import fcntl
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -189,12 +190,22 @@ def prove(copy: Copy, mutant: Mutant) -> str:
     """The first test that fails, or nothing. The likeliest run alone, then all others."""
     first = PROOFS.get(f"{mutant.backend}/{Path(mutant.file).stem}", DEFAULT[mutant.backend])
     rest = [name for name in (ALL_GPU if mutant.backend == "gpu" else ALL) if name not in first]
-    return pytest(copy, mutant, [f"{TESTS}/{name}" for name in first]) or pytest(
-        copy, mutant, [f"{TESTS}/{name}" for name in rest]
-    )
+    return pytest(copy, mutant, map(place, first)) or pytest(copy, mutant, map(place, rest))
 
 
-def pytest(copy: Copy, mutant: Mutant | None, tests: Sequence[str]) -> str:
+def place(name: str) -> str:
+    """The path of a test, by the name of its file, which lies in any folder of the kernels' tests."""
+    file, colons, test = name.partition("::")
+    (path,) = (ROOT / TESTS).rglob(file)
+    return f"{path.relative_to(ROOT).as_posix()}{colons}{test}"
+
+
+def named(line: str) -> str:
+    """The test at the beginning of `line`, by the name of its file."""
+    return re.sub(rf"^{TESTS}/(?:[a-z]+/)*", "", line)
+
+
+def pytest(copy: Copy, mutant: Mutant | None, tests: Iterable[str]) -> str:
     """The first of the tests that fails on the mutant, or on the copy as it is; nothing where all pass."""
     others = " or ".join(name for name in isa.ISAS if name != ISA)
     # The interpreter's tests run for its own mutants alone; two builds that disagree do not say which is wrong.
@@ -228,10 +239,10 @@ def pytest(copy: Copy, mutant: Mutant | None, tests: Sequence[str]) -> str:
         return ""
     for line in done.stdout.splitlines():
         if line.startswith(("FAILED ", "ERROR ")):
-            return line.split(" ", 1)[1].split(" - ")[0].removeprefix(f"{TESTS}/")
+            return named(line.split(" ", 1)[1].split(" - ")[0])
     started = [line for line in done.stdout.splitlines() if line.startswith(f"{TESTS}/")]
     if done.returncode < 0 and started:  # killed by a signal: the test that was running has caught it
-        return started[-1].split(" ", 1)[0].removeprefix(f"{TESTS}/")
+        return named(started[-1].split(" ", 1)[0])
     raise SystemExit(f"pytest ended with {done.returncode}:\n{done.stdout[-3000:]}{done.stderr[-1000:]}")
 
 

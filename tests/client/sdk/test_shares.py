@@ -1,6 +1,6 @@
 """Links to a model through the SDK, synchronous and asynchronous, and through `splatmill shares`, on the real server.
 
-Not proved here: what a link opens, and for whom (tests/server/test_shares.py).
+Not proved here: what a link opens, and for whom (tests/server/models/test_shares.py).
 """
 
 import asyncio

@@ -1,6 +1,7 @@
 """Proves that folders of masks, depth maps and the like are no captures, and that maps beside photos are not used.
 
-Not proven here: that the page says the same (tests/browser/test_new.py), and what pixels say (images/test_no_photo.py).
+Not proven here: that the page says the same (tests/browser/new/test_new.py), and what pixels say
+(images/test_no_photo.py).
 """
 
 from __future__ import annotations

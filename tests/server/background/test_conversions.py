@@ -32,9 +32,9 @@ from splatmill_server.responses.single_file import WEB
 from splatmill_worker.splat.formats import registry
 from tests.support.ball import write_ply
 from tests.support.command_line import invoke
-from tests.support.rendering import hold_out, renderer_in
-from tests.support.scripted_server import Reply, scripted_server
 from tests.support.served_app import Serve, ServedApp, problem, store_model
+from tests.support.servers.rendering import hold_out, renderer_in
+from tests.support.servers.scripted_server import Reply, scripted_server
 from tests.support.waiting import wait_for
 
 pytestmark = pytest.mark.slow

@@ -18,9 +18,9 @@ from splatmill.backplane.queue import leases
 from splatmill.schema import JobState, LogEvent, Problem, ProgressEvent, StateEvent, TrainOptions
 from splatmill_server.background import deliveries
 from splatmill_server.jobs.records import Jobs
-from tests.support.queue_entries import take
-from tests.support.scripted_server import Reply, ScriptedServer, scripted_server
 from tests.support.served_app import Serve, ServedApp
+from tests.support.servers.queue_entries import take
+from tests.support.servers.scripted_server import Reply, ScriptedServer, scripted_server
 from tests.support.waiting import wait_for
 
 FAILED = StateEvent(state=JobState.failed, problem=Problem.of("diverged", "It went wrong."))

@@ -15,8 +15,8 @@ from splatmill.backplane import keys
 from splatmill.backplane.storage import layout
 from splatmill.schema import Role
 from splatmill_server.background import imports
-from tests.support.scripted_server import Reply, ScriptedServer, scripted_server
 from tests.support.served_app import Serve, ServedApp, problem, stored
+from tests.support.servers.scripted_server import Reply, ScriptedServer, scripted_server
 from tests.support.waiting import wait_for
 
 DATA = os.urandom(400_000)

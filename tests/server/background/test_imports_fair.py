@@ -15,8 +15,8 @@ from splatmill.backplane.storage import layout
 from splatmill_server.background import imports
 from splatmill_server.base import least_rate, unfinished
 from splatmill_server.space import usage
-from tests.support.scripted_server import Reply, ScriptedServer, Seen, scripted_server
 from tests.support.served_app import Serve, ServedApp, problem, stored
+from tests.support.servers.scripted_server import Reply, ScriptedServer, Seen, scripted_server
 from tests.support.waiting import wait_for
 
 CRAWLING = Reply(body=b"x" * 5000, pace=0.05)

@@ -26,8 +26,8 @@ from splatmill_server.background import kept, meshes
 from splatmill_worker.mesh import ply
 from tests.support.ball import PROPERTIES, write_ply
 from tests.support.command_line import invoke, spawn
-from tests.support.rendering import renderer_in
 from tests.support.served_app import Serve, ServedApp, problem, store_model, stored
+from tests.support.servers.rendering import renderer_in
 from tests.support.waiting import wait_for
 from tests.worker.mesh.test_triangles import chunks, values
 

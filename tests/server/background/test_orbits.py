@@ -27,8 +27,8 @@ from splatmill_server.background import kept, orbits
 from splatmill_server.space import usage
 from tests.support.ball import write_ply
 from tests.support.command_line import invoke, spawn
-from tests.support.rendering import renderer_in
 from tests.support.served_app import Serve, ServedApp, problem, store_model, stored
+from tests.support.servers.rendering import renderer_in
 from tests.support.waiting import wait_for
 
 pytestmark = pytest.mark.slow

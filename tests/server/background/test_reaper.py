@@ -20,8 +20,8 @@ from splatmill.backplane import keys
 from splatmill.backplane.jobs import row
 from splatmill.backplane.queue import entries, leases, queue, rq_keys
 from splatmill.schema import JobState, ProgressEvent, StateEvent
-from tests.support.queue_entries import take, waiting
 from tests.support.served_app import Serve, ServedApp, store_model
+from tests.support.servers.queue_entries import take, waiting
 from tests.support.waiting import wait_for
 
 pytestmark = pytest.mark.slow

@@ -11,8 +11,8 @@ import pytest
 from splatmill.backplane.storage import layout
 from splatmill.schema import CreateWebhook, Job
 from splatmill_server.background import deliveries
-from tests.support.scripted_server import Reply, ScriptedServer, Seen, scripted_server
 from tests.support.served_app import Serve, ServedApp, stored
+from tests.support.servers.scripted_server import Reply, ScriptedServer, Seen, scripted_server
 from tests.support.waiting import wait_for
 
 

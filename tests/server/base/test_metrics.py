@@ -20,8 +20,8 @@ from splatmill.schema import JobState, Problem, StateEvent, TrainOptions
 from splatmill_server.base.metrics import OF_PROCESS, SAME, SMALLEST, Metrics
 from splatmill_server.base.scrape import families, of_disk, of_renderer
 from splatmill_server.jobs import outcome
-from tests.support.queue_entries import take
 from tests.support.served_app import Serve, ServedApp
+from tests.support.servers.queue_entries import take
 
 Samples = dict[tuple[str, tuple[str, ...]], float]
 

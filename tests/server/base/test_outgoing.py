@@ -25,7 +25,7 @@ from splatmill_server.base.outgoing import (
     refusal,
 )
 from tests.support.programs import program
-from tests.support.scripted_server import Reply, ScriptedServer, scripted_server
+from tests.support.servers.scripted_server import Reply, ScriptedServer, scripted_server
 
 
 @pytest.fixture

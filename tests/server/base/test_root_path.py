@@ -28,8 +28,8 @@ from splatmill_server.access.sessions import COOKIE
 from splatmill_server.base.root_path import HEADER, OWN_PATHS, checked
 from splatmill_server.base.settings import Settings
 from splatmill_server.web import pages
-from tests.support.path_proxy import path_proxy
 from tests.support.served_app import Serve, ServedApp, problem
+from tests.support.servers.path_proxy import path_proxy
 from tests.support.waiting import wait_for
 
 PUBLISHED = [

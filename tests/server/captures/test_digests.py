@@ -16,8 +16,8 @@ import pytest
 from splatmill.backplane.storage import layout
 from splatmill.schema import Role
 from splatmill_server.captures import digests
-from tests.support.faulty_s3 import FaultyS3, Request, faulty_s3
 from tests.support.served_app import Serve, ServedApp, problem
+from tests.support.servers.faulty_s3 import FaultyS3, Request, faulty_s3
 
 pytestmark = pytest.mark.slow
 

@@ -22,8 +22,8 @@ from splatmill.backplane.storage.storage import Entry
 from splatmill.schema import SHA256_HEADER, Role
 from splatmill_server.base.problems import ProblemError
 from splatmill_server.captures import unfinished_uploads
-from tests.support.bucket import bucket
 from tests.support.served_app import Serve, ServedApp, problem
+from tests.support.servers.bucket import bucket
 from tests.support.waiting import wait_for
 
 DATA = random.Random(1).randbytes(3_000_001)

@@ -16,9 +16,9 @@ from splatmill.schema import EstimateJob, TrainOptions
 from splatmill.schema.conflicts import CONFLICTS
 from splatmill_server.jobs.estimate import estimate, least_within
 from splatmill_server.jobs.finished import Figures, figures
-from tests.support.facts import changed, planned
-from tests.support.formats import V1, job_ids
+from tests.support.plans.facts import changed, planned
 from tests.support.served_app import ServedApp, problem
+from tests.support.stored.formats import V1, job_ids
 
 STORED = V1 / "storage" / "models" / job_ids()["succeeded"]
 

@@ -16,8 +16,8 @@ from splatmill.backplane.connection import connect
 from splatmill.backplane.queue import leases, lines, queue, rq_keys
 from splatmill.backplane.queue.leases import Lease, Reclaim
 from tests.support.jobs import write_row
-from tests.support.queue_entries import take, waiting
 from tests.support.redis_server import RedisServer
+from tests.support.servers.queue_entries import take, waiting
 from tests.support.waiting import wait_for
 
 SHIFTED = """

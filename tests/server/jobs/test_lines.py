@@ -21,9 +21,9 @@ from splatmill.schema import Backend, TrainOptions
 from splatmill_server.jobs import queue_places
 from splatmill_server.jobs.queue_places import start_after
 from tests.support.jobs import write_row
-from tests.support.queue_entries import take, waiting
 from tests.support.redis_server import RedisServer
 from tests.support.served_app import ServedApp
+from tests.support.servers.queue_entries import take, waiting
 
 
 def submit(

@@ -11,7 +11,7 @@ from splatmill.backplane.storage import layout
 from splatmill.schema import CamerasEvent, JobState, Placement, SnapshotEvent, StateEvent
 from splatmill_server.routes.jobs.live import WATCH_SECONDS
 from tests.support.served_app import ServedApp, problem
-from tests.support.server_events import follow
+from tests.support.servers.server_events import follow
 
 
 def shown(connection: redis.Redis, job_id: str, ply: bytes, tag: str) -> None:

@@ -30,9 +30,9 @@ from splatmill_server.access.caller import Caller
 from splatmill_server.base.problems import ProblemError
 from splatmill_server.jobs import log as job_log
 from splatmill_server.jobs import restoring
-from tests.support.queue_entries import take, waiting
 from tests.support.served_app import ServedApp, problem
-from tests.support.server_events import brief, follow
+from tests.support.servers.queue_entries import take, waiting
+from tests.support.servers.server_events import brief, follow
 
 
 def listed(app: ServedApp, path: str = "/v1/jobs") -> dict[str, Any]:

@@ -23,7 +23,7 @@ from splatmill.schema import (
 )
 from splatmill_server.jobs import shrinking
 from tests.support.served_app import ServedApp
-from tests.support.server_events import brief, follow
+from tests.support.servers.server_events import brief, follow
 
 LIMIT = 10_000
 """Bytes that an ended job may hold in Redis."""

@@ -15,7 +15,7 @@ from splatmill.backplane.jobs import events
 from splatmill.schema import JobState, LogEvent, MetricEvent, PlanEvent, Problem, ProgressEvent, StateEvent
 from splatmill_server.jobs.shrinking import shrink
 from tests.support.served_app import Serve, ServedApp, problem
-from tests.support.server_events import brief, follow, messages
+from tests.support.servers.server_events import brief, follow, messages
 
 
 def a_whole_job(app: ServedApp) -> str:

@@ -23,7 +23,7 @@ from splatmill_server.access.caller import Caller
 from splatmill_server.base import feed
 from splatmill_server.base.feed import Batch, Feed
 from tests.support.served_app import Serve, ServedApp, problem
-from tests.support.server_events import brief, follow
+from tests.support.servers.server_events import brief, follow
 from tests.support.waiting import wait_for
 
 FOLLOWERS = 150

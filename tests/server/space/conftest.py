@@ -12,8 +12,8 @@ from starlette.datastructures import Headers
 from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import KeyLimits, Scope
 from splatmill_server.access import caller
-from tests.support.bucket import bucket
 from tests.support.served_app import Serve, ServedApp
+from tests.support.servers.bucket import bucket
 
 
 class Clock:

@@ -22,8 +22,8 @@ from splatmill.schema import DOWNLOADS, CameraSpec, StoredKind
 from splatmill_server.space.quota import JOB_ROOM
 from tests.server.space.conftest import Clock, Person, ServePeople
 from tests.support.ball import write_ply
-from tests.support.rendering import hold_out, renderer_in
 from tests.support.served_app import ServedApp, problem, store_model
+from tests.support.servers.rendering import hold_out, renderer_in
 from tests.support.waiting import wait_for
 
 pytestmark = pytest.mark.slow

@@ -17,7 +17,7 @@ from PIL import Image
 
 from splatmill.schema.files.masks import MASK_BEGINNINGS, MASK_ENDINGS
 from splatmill_worker.images.mask_levels import judged
-from tests.support import unmarked_zip
+from tests.support.files import unmarked_zip
 from tests.support.paths import ROOT
 from tests.support.programs import node
 

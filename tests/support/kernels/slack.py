@@ -15,16 +15,16 @@ import pytest
 from tests.support.kernels import bounds
 
 PROOFS = [
-    f"tests/kernels/test_{name}.py"
+    f"tests/kernels/{name}.py"
     for name in (
-        "proof_forward",
-        "proof_backward",
-        "proof_step",
-        "cpu_step",
-        "cpu_pose",
-        "loss",
-        "adam",
-        "knn",
+        "proofs/test_proof_forward",
+        "proofs/test_proof_backward",
+        "proofs/test_proof_step",
+        "cpu/test_cpu_step",
+        "cpu/test_cpu_pose",
+        "test_loss",
+        "test_adam",
+        "test_knn",
     )
 ]
 MEDIAN, LEAST = 0.05, 0.1

@@ -33,8 +33,8 @@ from splatmill_worker.splat.formats import ply
 from splatmill_worker.splat.plan import schedule
 from splatmill_worker.splat.train.run import TrainingRun
 from splatmill_worker.synthetic import orbit, photograph, still_life
-from tests.support import decisions
-from tests.support.pairwise import covering, pairs
+from tests.support.plans import decisions
+from tests.support.plans.pairwise import covering, pairs
 
 WIDTH, HEIGHT, COUNT = decisions.LONGEST, 24, 14
 

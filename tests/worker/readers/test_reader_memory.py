@@ -16,10 +16,10 @@ from plyfile import PlyData, PlyElement
 from splatmill_worker.readers import reader_memory
 from splatmill_worker.splat.formats import palette, registry
 from splatmill_worker.splat.gaussians import Gaussians
+from tests.support.decoding.reader_peak import peaks
+from tests.support.files.ksplat_files import ksplat
 from tests.support.gaussians import some_gaussians
 from tests.support.hostile import model_bombs
-from tests.support.ksplat_files import ksplat
-from tests.support.reader_peak import peaks
 
 pytestmark = [
     pytest.mark.slow,

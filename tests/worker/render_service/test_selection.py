@@ -1,7 +1,7 @@
 """Proves which Gaussians strokes hold: by hand-computed places, by a slow definition on random ones, and that an edit
 leaves out what was selected.
 
-That the page selects the same is proved in tests/browser/test_selection.py.
+That the page selects the same is proved in tests/browser/model/test_selection.py.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from splatmill_worker.render_service.edit import kept
 from splatmill_worker.render_service.selection import selected, within
 from splatmill_worker.splat.formats import ply
 from tests.support.ball import write_ply
-from tests.support.strokes import FRONT, random_strokes
+from tests.support.page.strokes import FRONT, random_strokes
 
 SQUARE = [(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)]
 

@@ -12,8 +12,8 @@ from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import Role
 from splatmill_worker.service.room import Room
+from tests.support.files.other_file_system import other_file_system as other_file_system
 from tests.support.jobs import CAPTURE
-from tests.support.other_file_system import other_file_system as other_file_system
 from tests.support.redis_server import connection as connection
 from tests.support.redis_server import redis_server as redis_server
 

@@ -61,7 +61,7 @@ from splatmill.backplane.connection import connect
 from splatmill_worker.service import disk_reserve
 from splatmill_worker.service.attempts.attempt import start_attempt
 from splatmill_worker.service.attempts.run_attempt import run_attempt
-from tests.support import standin
+from tests.support.servers import standin
 url, entry, checkpoint, full_at = sys.argv[1:]
 real = disk_reserve._free_bytes
 

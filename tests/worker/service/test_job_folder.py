@@ -1,7 +1,7 @@
 """Proves what a job's folder holds: the staged capture, and what an attempt elsewhere needs. One process has it.
 
 The storage is a folder, the same folder as if it were a bucket, and a bucket (moto's server). Not proved here: the
-bucket's own failures (tests/server/test_bucket).
+bucket's own failures (tests/server/storage/test_bucket).
 """
 
 import os
@@ -26,8 +26,8 @@ from splatmill_worker.service.hand_back import HandedBack
 from splatmill_worker.service.job_folder import JobFolder, hold
 from splatmill_worker.service.room import Room
 from splatmill_worker.service.staging import DOWNLOADS
-from tests.support.faulty_s3 import FaultyS3, faulty_s3
 from tests.support.jobs import CAPTURE
+from tests.support.servers.faulty_s3 import FaultyS3, faulty_s3
 from tests.support.waiting import wait_for
 
 JOB, OTHER = "job00001", "job00002"

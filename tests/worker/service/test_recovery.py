@@ -15,7 +15,7 @@ from splatmill_worker.service import recovery
 from splatmill_worker.service.command import _pipeline
 from splatmill_worker.service.rq_worker import AttemptWorker
 from tests.support.jobs import write_row
-from tests.support.queue_entries import take, waiting
+from tests.support.servers.queue_entries import take, waiting
 
 
 def registered(connection: redis.Redis, name: str, **fields: str) -> None:

@@ -27,8 +27,8 @@ from splatmill_worker.service.attempts.attempt import Attempt
 from splatmill_worker.service.attempts.outbox import Outbox
 from splatmill_worker.service.lock import JobLock
 from tests.support.jobs import CAPTURE, messages, read_job, write_row
-from tests.support.queue_entries import take
 from tests.support.redis_server import RedisServer
+from tests.support.servers.queue_entries import take
 from tests.support.up import STANDIN
 from tests.support.waiting import wait_for
 

@@ -9,7 +9,7 @@ import redis
 
 from splatmill.backplane.queue import entries, leases, lines, queue, rq_keys
 from tests.support.jobs import write_row
-from tests.support.queue_entries import take, waiting
+from tests.support.servers.queue_entries import take, waiting
 
 JOB, ENTRY = "job00001", "job00001-1"
 

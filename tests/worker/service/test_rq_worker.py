@@ -24,10 +24,10 @@ from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import Backend, Job, Role, TrainOptions
 from splatmill_worker.service.rq_worker import AttemptWorker
-from tests.support import standin
 from tests.support.jobs import CAPTURE, read_job, write_row
-from tests.support.queue_entries import waiting
 from tests.support.redis_server import RedisServer
+from tests.support.servers import standin
+from tests.support.servers.queue_entries import waiting
 from tests.support.up import STANDIN
 from tests.support.waiting import wait_for
 
@@ -264,9 +264,7 @@ def test_a_job_for_a_gpu_waits_for_a_worker_that_has_one(
     environment = dict(os.environ) | STANDIN
     environment |= {"SPLATMILL_DATA": str(tmp_path / "data"), "SPLATMILL_STORAGE": storage.url}
     code = "import sys; from splatmill.backplane.connection import connect; "
-    code += (
-        "from splatmill_worker.service.rq_worker import AttemptWorker; from tests.support import standin; "
-    )
+    code += "from splatmill_worker.service.rq_worker import AttemptWorker; from tests.support.servers import standin; "
     code += "AttemptWorker(connect(sys.argv[1]), lambda: standin.run, ('gpu',)).work(burst=True)"
     subprocess.run([sys.executable, "-c", code, redis_server.url], env=environment, check=True, timeout=60)
     assert read_job(connection, "job00001").state == "succeeded"

@@ -16,8 +16,8 @@ from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import Role
 from tests.support.jobs import CAPTURE, read_job, write_row
-from tests.support.queue_entries import waiting
 from tests.support.redis_server import RedisServer
+from tests.support.servers.queue_entries import waiting
 from tests.support.up import STANDIN
 
 CONTINUES = 3

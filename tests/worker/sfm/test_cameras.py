@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from splatmill_worker.sfm import cameras
-from tests.support.photos import usable
+from tests.support.scenes.photos import usable
 
 
 def test_photos_that_agree_share_a_camera() -> None:

@@ -20,7 +20,7 @@ from splatmill_worker.sfm.features import FeatureStore
 from splatmill_worker.sfm.mapping import mapper
 from splatmill_worker.sfm.matching import pairs
 from splatmill_worker.sfm.run import SfmRun
-from tests.support.motions import FOCAL, ball, model_of
+from tests.support.scenes.motions import FOCAL, ball, model_of
 
 pytestmark = pytest.mark.slow
 

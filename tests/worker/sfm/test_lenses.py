@@ -8,7 +8,7 @@ import pytest
 from splatmill_worker.sfm import lenses
 from splatmill_worker.sfm.cameras import CameraGroup
 from splatmill_worker.sfm.mapping.adjust import bundle_adjust
-from tests.support.motions import FOCAL, HEIGHT, WIDTH, Motion, ball, circle, model_of
+from tests.support.scenes.motions import FOCAL, HEIGHT, WIDTH, Motion, ball, circle, model_of
 
 PHOTOS = tuple(range(36))
 

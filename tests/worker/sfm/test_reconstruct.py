@@ -22,7 +22,7 @@ from splatmill_worker import sfm, synthetic
 from splatmill_worker.errors import Cancelled, Refusal
 from splatmill_worker.scene import Camera, Scene
 from tests.support.paths import DATA
-from tests.support.poses import pose_errors
+from tests.support.scenes.poses import pose_errors
 
 pytestmark = pytest.mark.slow
 

@@ -22,7 +22,7 @@ from splatmill_worker.sfm.run import EffortResult, SfmRun
 from splatmill_worker.synthetic.ray_caster import Cylinder, Disc, StillLife, look_at, picture
 from splatmill_worker.synthetic.textures import MipMap, painted, sky
 from tests.support.paths import DATA
-from tests.support.poses import pose_errors
+from tests.support.scenes.poses import pose_errors
 
 pytestmark = pytest.mark.slow
 

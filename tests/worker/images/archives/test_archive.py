@@ -22,7 +22,7 @@ from splatmill_worker.images.archives import archive
 from splatmill_worker.images.archives.archive import Allowance, UnsafeArchive, unpack
 from splatmill_worker.images.decoding import decoders
 from splatmill_worker.images.video import video
-from tests.support import unmarked_zip
+from tests.support.files import unmarked_zip
 from tests.support.hostile import archives, pictures, videos
 
 

@@ -19,7 +19,7 @@ from splatmill_worker.images import examine as examine_here
 from splatmill_worker.images.decoding import decoders
 from splatmill_worker.images.decoding.decoders import Decoders, confined
 from splatmill_worker.images.prepare import prepare
-from tests.support.acting import children
+from tests.support.decoding.acting import children
 from tests.support.hostile.videos import video
 from tests.support.waiting import wait_for
 

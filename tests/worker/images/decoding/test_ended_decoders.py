@@ -34,7 +34,7 @@ from splatmill_worker.images.video import video as video_here
 from splatmill_worker.readers import reader_memory
 from splatmill_worker.service.attempts.problems import is_transient, keeps_progress, problem_of
 from splatmill_worker.sfm import posed
-from tests.support.acting import acts, children
+from tests.support.decoding.acting import acts, children
 from tests.support.hostile.videos import video
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="the moments are those of processes of Linux")

@@ -15,8 +15,8 @@ from PIL import Image
 from splatmill_worker.images.panoramas import panoramas
 from splatmill_worker.images.panoramas.panoramas import Candidate, Sphere, decided
 from splatmill_worker.images.prepare import Prepared, prepare
+from tests.support.files.spherical_video import call_spherical
 from tests.support.panoramas import gpano, striped, walk, write
-from tests.support.spherical_video import call_spherical
 
 
 def prepared(folder: Path) -> Prepared:

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     import _soak.pipeline
 
     import splatmill_worker.pipeline
-    from tests.support import standin
+    from tests.support.servers import standin
 
     # What an attempt may be told to run has to take what it passes: mypy compares them here.
     PIPELINES: list[module.Pipeline] = [

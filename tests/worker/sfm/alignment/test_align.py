@@ -156,7 +156,7 @@ def test_the_same_scan_gives_the_same_similarity() -> None:
 
 def test_places_that_fit_equally_well_are_told_apart() -> None:
     """Colours exchanged: no place is right, and many hold the same few points of the scene."""
-    points, colors = (each[::40] for each in scanned())
+    points, colors = scanned()[0][::40], scanned()[1][::40]
     own = still_life.scene()
     exchanged = np.random.default_rng(1).permutation(len(colors))
     found = align(points, colors[exchanged], own.points[::20], own.colors[::20])

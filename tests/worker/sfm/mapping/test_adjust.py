@@ -10,7 +10,7 @@ import pytest
 from splatmill_worker.errors import Cancelled
 from splatmill_worker.sfm.mapping import adjust
 from splatmill_worker.sfm.mapping.adjust import adjust_with_lenses
-from tests.support.motions import FOCAL, Motion, ball, circle, grid, line, model_of
+from tests.support.scenes.motions import FOCAL, Motion, ball, circle, grid, line, model_of
 
 
 @pytest.mark.parametrize(

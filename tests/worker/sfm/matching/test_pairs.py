@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from splatmill_worker.sfm.matching import pairs
-from tests.support.photos import usable
+from tests.support.scenes.photos import usable
 
 
 def test_gps_neighbours_are_the_nearest_ones() -> None:

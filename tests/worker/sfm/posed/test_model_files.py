@@ -16,9 +16,9 @@ from splatmill_worker.readers import colmap_files, point_file
 from splatmill_worker.sfm import posed
 from splatmill_worker.sfm.posed import model_files, transforms
 from splatmill_worker.sfm.posed.files import ImageFiles
+from tests.support.decoding.reader_peak import peaks
 from tests.support.hostile import model_bombs, models, pictures
 from tests.support.hostile.pictures import write
-from tests.support.reader_peak import peaks
 
 READ = "splatmill_worker.sfm.posed.model_files:read"
 

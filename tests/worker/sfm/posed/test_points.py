@@ -24,7 +24,7 @@ from splatmill_worker.sfm.options import LEAN
 from splatmill_worker.sfm.posed.judged.conventions import FLIP
 from splatmill_worker.sfm.posed.judged.triangulation import Triangulated, triangulate
 from splatmill_worker.splat.plan.decide import decide
-from tests.support.facts import FACTS
+from tests.support.plans.facts import FACTS
 
 pytestmark = pytest.mark.slow
 

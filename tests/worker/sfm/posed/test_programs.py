@@ -18,9 +18,9 @@ from splatmill_worker.colmap import pycolmap
 from splatmill_worker.images.decoding import decoders
 from splatmill_worker.scene import Scene, View
 from splatmill_worker.sfm import posed
-from tests.support import program_files as written
+from tests.support.files import program_files as written
+from tests.support.files.program_files import PROGRAMS, SIZE, Float
 from tests.support.posed_sets import ALL, COUNT, NAMES, check, loaded, model, photos, transforms, viewmat
-from tests.support.program_files import PROGRAMS, SIZE, Float
 
 VIEWMATS = [viewmat(k) for k in range(COUNT)]
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.support.files.program_files import PROGRAMS, SIZE
 from tests.support.posed_sets import (
     ALL,
     COUNT,
@@ -26,7 +27,6 @@ from tests.support.posed_sets import (
     transforms,
     viewmat,
 )
-from tests.support.program_files import PROGRAMS, SIZE
 
 WRITERS: dict[str, Callable[[Path], object]] = {
     "transforms.json": lambda folder: transforms(folder / "transforms.json"),

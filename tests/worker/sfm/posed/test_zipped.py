@@ -22,8 +22,8 @@ from splatmill_worker.pipeline.capture import posed_scene
 from splatmill_worker.sfm import posed
 from splatmill_worker.sfm.posed import zipped
 from tests.support import posed_sets, still_life
+from tests.support.files.program_files import PROGRAMS, SIZE
 from tests.support.posed_sets import NAMES
-from tests.support.program_files import PROGRAMS, SIZE
 
 
 @pytest.fixture

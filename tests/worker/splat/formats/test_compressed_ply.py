@@ -14,9 +14,9 @@ from plyfile import PlyData
 
 from splatmill_worker.errors import ModelUnreadable
 from splatmill_worker.splat.formats import compressed_ply, ply, registry
+from tests.support.files.splat_transform import convert
 from tests.support.gaussians import differences, matched, some_gaussians
 from tests.support.paths import DATA
-from tests.support.splat_transform import convert
 
 OTHERS = DATA / "splats"
 

@@ -18,8 +18,8 @@ import torch
 from splatmill_worker.errors import ModelUnreadable
 from splatmill_worker.splat.formats import ply, registry, sog
 from splatmill_worker.splat.gaussians import Gaussians
+from tests.support.files.splat_transform import convert
 from tests.support.gaussians import differences, matched, some_gaussians
-from tests.support.splat_transform import convert
 
 
 def _few_colors(scene: Gaussians) -> Gaussians:

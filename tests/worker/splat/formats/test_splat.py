@@ -15,10 +15,10 @@ import torch
 
 from splatmill_worker.errors import ModelUnreadable
 from splatmill_worker.splat.formats import ksplat, ply, splat
+from tests.support.files.ksplat_files import ksplat as ksplat_file
+from tests.support.files.splat_transform import convert
 from tests.support.gaussians import differences
-from tests.support.ksplat_files import ksplat as ksplat_file
 from tests.support.paths import DATA
-from tests.support.splat_transform import convert
 
 OTHERS = DATA / "splats/minimal"
 

@@ -23,11 +23,11 @@ from splatmill_worker.splat.formats import ply, registry, spz
 from splatmill_worker.splat.formats.frames import turned_about_x
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.render import render
-from tests.support import niantic_spz
+from tests.support.files import niantic_spz
+from tests.support.files.splat_transform import convert
 from tests.support.gaussians import differences, matched, some_gaussians
 from tests.support.hostile.archives import gzip_of_zeros
 from tests.support.paths import DATA
-from tests.support.splat_transform import convert
 
 OTHERS = DATA / "splats"
 

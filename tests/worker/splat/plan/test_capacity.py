@@ -10,7 +10,7 @@ import pytest
 from splatmill_worker.splat.plan.budget import Budget
 from splatmill_worker.splat.plan.facts import Speed
 from splatmill_worker.splat.plan.plan import Plan
-from tests.support.facts import changed, planned
+from tests.support.plans.facts import changed, planned
 
 
 @pytest.mark.parametrize(

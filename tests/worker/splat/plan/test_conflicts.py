@@ -22,7 +22,7 @@ from splatmill_worker.pipeline.capture import posed_scene
 from splatmill_worker.splat.plan.decide import decide
 from splatmill_worker.splat.plan.plan import Kernels
 from splatmill_worker.splat.start.given_model import GivenModel
-from tests.support.facts import changed
+from tests.support.plans.facts import changed
 
 MODEL = GivenModel(700, 2, psnr=27.0, one_color=12.0, another=11.0)
 MODELS = ("a" * 16, "m.spz", "m.sog", "m.compressed.ply", "m.ply")

@@ -14,7 +14,7 @@ from splatmill_worker.splat.engine.open import open_engine
 from splatmill_worker.splat.plan.facts import measure
 from splatmill_worker.splat.start.points import from_points
 from tests.support import still_life
-from tests.support.facts import changed, planned
+from tests.support.plans.facts import changed, planned
 from tests.support.training import sparse_scene
 
 LARGE: dict[str, Any] = {"views": 400, "width": 640, "height": 480, "memory_available": 64 * 10**9}

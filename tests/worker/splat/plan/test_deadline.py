@@ -13,7 +13,7 @@ from splatmill_worker.splat.plan.deadline import (
     STORING_STEPS,
 )
 from splatmill_worker.splat.plan.evaluated import curve_views
-from tests.support.facts import changed, planned
+from tests.support.plans.facts import changed, planned
 
 
 def test_training_gets_what_is_left_but_for_measuring_and_storing() -> None:

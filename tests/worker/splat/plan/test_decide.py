@@ -18,7 +18,7 @@ from splatmill_worker.splat.plan.decide import DROPOUT
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.plan.rates import Annealing, beta2_of
 from splatmill_worker.splat.start.given_model import GivenModel
-from tests.support.facts import FACTS, changed, planned
+from tests.support.plans.facts import FACTS, changed, planned
 
 COVERED = {"sightings": 80.0, "sky_share": 0.01, "gap_share": 0.3, "gap_points": 5000, "shell_points": 800}
 VARIANTS: list[dict[str, Any]] = [

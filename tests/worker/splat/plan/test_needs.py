@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from splatmill_worker.splat.start.given_model import GivenModel
-from tests.support.facts import changed, planned
+from tests.support.plans.facts import changed, planned
 
 MODEL = GivenModel(700, 2, psnr=27.0, one_color=12.0, another=11.0)
 BARE: dict[str, Any] = {"gap_share": 0.4, "gap_points": 500, "sightings": 80.0}

@@ -9,7 +9,7 @@ import pytest
 
 from splatmill.schema import TrainOptions
 from splatmill_worker.splat.plan.photos import loading_size
-from tests.support.facts import changed, planned
+from tests.support.plans.facts import changed, planned
 
 
 def test_photos_are_loaded_at_the_presets_size_or_the_one_asked_for() -> None:

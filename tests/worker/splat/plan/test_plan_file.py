@@ -13,7 +13,7 @@ import pytest
 
 from splatmill.schema import Switch, TrainOptions
 from splatmill_worker.splat.plan.plan_file import read_plan, write_plan
-from tests.support.facts import planned
+from tests.support.plans.facts import planned
 
 
 def test_a_plan_is_read_back_for_the_options_it_was_made_for(tmp_path: Path) -> None:

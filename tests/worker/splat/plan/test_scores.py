@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tests.support.facts import changed, planned
+from tests.support.plans.facts import changed, planned
 
 
 def test_lpips_is_measured_where_it_can_be() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from splatmill_worker.splat.start.cells import Cells, projected, visible_points
-from tests.support.street import BRICK, right_half, street
+from tests.support.scenes.street import BRICK, right_half, street
 from tests.support.training import sparse_scene
 
 

@@ -13,7 +13,7 @@ import torch
 from splatmill_worker.splat.start import far_shell
 from splatmill_worker.splat.start.cells import Cells
 from splatmill_worker.splat.views import TrainingView
-from tests.support.street import BLUE, BRICK, right_half, street
+from tests.support.scenes.street import BLUE, BRICK, right_half, street
 
 
 def test_the_shell_is_far_and_wherever_photos_look() -> None:

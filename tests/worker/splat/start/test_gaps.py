@@ -10,7 +10,7 @@ import pytest
 
 from splatmill_worker.splat.start.cells import Cells
 from splatmill_worker.splat.start.gaps import gap_points, gap_share
-from tests.support.street import BRICK, right_half, street
+from tests.support.scenes.street import BRICK, right_half, street
 
 
 def test_gaps_are_cells_without_sky_and_without_points() -> None:

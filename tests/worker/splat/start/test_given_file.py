@@ -23,7 +23,7 @@ from splatmill_worker.scene import Normalization
 from splatmill_worker.splat.formats import registry
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.start.given_model import read_given_model
-from tests.support.acting import children
+from tests.support.decoding.acting import children
 from tests.support.gaussians import some_gaussians
 from tests.support.hostile import model_bombs
 

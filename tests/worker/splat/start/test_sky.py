@@ -10,7 +10,7 @@ import pytest
 
 from splatmill_worker.splat.start.cells import Cells
 from splatmill_worker.splat.start.sky import sky_of, sky_share
-from tests.support.street import BLUE, BRICK, street
+from tests.support.scenes.street import BLUE, BRICK, street
 
 CLOUD = (215, 218, 225)
 

@@ -1,7 +1,7 @@
 """Proves which Gaussians a step leaves out, that the others make up for them, and that opacities come back.
 
-On a tiny scene, with the engines of every machine; `tests/kernels/test_gpu_train.py` has the one of the GPU. Does not
-prove that it pays: `bench train` measures that (`no-dropout`).
+On a tiny scene, with the engines of every machine; `tests/kernels/gpu/test_gpu_train.py` has the one of the GPU. Does
+not prove that it pays: `bench train` measures that (`no-dropout`).
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ from splatmill_worker.splat.plan.evaluated import (
 from splatmill_worker.splat.start.points import from_points
 from splatmill_worker.splat.train.loop import train
 from tests.support import still_life
-from tests.support.facts import FACTS
+from tests.support.plans.facts import FACTS
 
 
 def test_the_choice_is_even_and_never_more_than_there_are() -> None:

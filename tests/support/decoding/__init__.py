@@ -1,0 +1,1 @@
+"""Decoding processes as tests ask, watch and attack them."""

@@ -1,0 +1,1 @@
+"""The rows of the list of hostile inputs, by what they attack."""

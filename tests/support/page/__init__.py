@@ -1,0 +1,1 @@
+"""The web page as people and their devices meet it."""

@@ -1,0 +1,1 @@
+"""Facts, decisions and plans of a training."""

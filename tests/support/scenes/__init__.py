@@ -1,0 +1,1 @@
+"""Scenes, cameras and photos with a known truth."""

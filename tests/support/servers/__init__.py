@@ -1,0 +1,1 @@
+"""Servers, proxies and stand-ins around the service, its queue and its events."""

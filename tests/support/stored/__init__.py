@@ -1,0 +1,1 @@
+"""What earlier versions stored, and what makes it."""
