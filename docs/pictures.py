@@ -2,7 +2,7 @@
 
     make pictures
 
-It takes some minutes. The pictures are `docs/photographing.jpg` and `docs/disagreeing.jpg`.
+It takes some minutes. The pictures are `docs/pictures/photographing.jpg` and `docs/pictures/disagreeing.jpg`.
 """
 
 import json
@@ -25,7 +25,7 @@ from splatmill_worker.splat.render import render
 from splatmill_worker.splat.report import disagreeing
 from splatmill_worker.synthetic import Movers, capture, look_at, orbit, photograph, still_life
 
-OUT = Path(__file__).parent
+OUT = Path(__file__).parent / "pictures"
 WIDTH, HEIGHT = 640, 480
 SHOWN = 400
 """Pixels of the width of each picture in a row."""

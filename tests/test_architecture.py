@@ -62,7 +62,6 @@ MOST_FILES = 20
 """Files of a folder."""
 
 FULLER = {
-    "docs": 30,
     "server/bench": 24,
     "server/splatmill_server/web/page": 21,
     "worker/bench": 40,

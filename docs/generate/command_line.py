@@ -18,7 +18,7 @@ INTRODUCTION = """# Command line
 Every command of `splatmill`, generated from the program. Commands that talk to a server take `--server URL`, or read
 the address from `SPLATMILL_SERVER`, and use the server on this machine when neither is given. The API key is read from
 `SPLATMILL_API_KEY` alone, so that it does not appear in the list of processes. `--profile NAME` stands for a server
-with its key, as [the SDK](../sdk.md#servers-by-name) describes.
+with its key, as [the SDK](../programming/sdk.md#servers-by-name) describes.
 
 `splatmill --install-completion` sets up completion in bash, zsh, fish and PowerShell: of commands, options, and the
 values of options that have a fixed set of them.

@@ -19,9 +19,10 @@ A refused request and a failed job are described by the same document, a problem
 | `instance` | The request or job that the problem happened to. |
 | `type` | `urn:splatmill:problem:` and the code. |
 
-The SDK raises problems as exceptions with the attributes `problem` and `code` ([The errors](../sdk.md#errors)); the
-command line prints detail, facts and advice, and ends with an [exit status](command-line.md#exit-status) for the kind
-of problem. [Photographing for splats](../photographing.md#when-cameras-fail) explains the codes that photos lead to.
+The SDK raises problems as exceptions with the attributes `problem` and `code`
+([The errors](../programming/sdk.md#errors)); the command line prints detail, facts and advice, and ends with an
+[exit status](command-line.md#exit-status) for the kind of problem.
+[Photographing for splats](../photographing.md#when-cameras-fail) explains the codes that photos lead to.
 
 These are all codes:
 """

@@ -14,7 +14,7 @@ from splatmill_server.base.settings import Settings
 INTRODUCTION = """# REST reference
 
 Every address of the server, generated from its OpenAPI document. A running server has that document at
-`/openapi.json`, and an overview as a web page at `/docs`. [The REST API](../rest.md) explains how the
+`/openapi.json`, and an overview as a web page at `/docs`. [The REST API](../programming/rest.md) explains how the
 addresses work together.
 
 Answers marked with a code are [problem documents](errors.md). Besides the codes listed, every address can answer with

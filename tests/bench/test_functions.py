@@ -94,7 +94,7 @@ def test_the_comparison_is_exact_enough() -> None:
 
 def test_the_page_of_the_documentation_is_made_from_rows() -> None:
     rows = bench.STUDY.rows()
-    page = (ROOT / "docs" / "precision.md").read_text()
+    page = (ROOT / "docs" / "programming" / "precision.md").read_text()
     assert "\n".join(bench.summary(rows)) in page
     assert f"{1e6 * EXP2_ERROR:.1f}·10⁻⁶ of {1e6 * ALPHA_ERROR:.1f}·10⁻⁶" in page
 

@@ -17,12 +17,12 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.documentation.markdown import Block, blocks
+from tests.support.documentation.markdown import GUIDES, Block, blocks
 from tests.support.documentation.reader import Beginning, Reader, Services
 from tests.support.documentation.shapes import mismatch
 from tests.support.paths import ROOT
 
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", *GUIDES]
 RUN = {"bash", "python"}
 CHECKED = {"output", "json", "text"}
 MARKS = {None, "not run", "exits", "serves"}

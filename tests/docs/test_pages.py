@@ -18,12 +18,12 @@ from splatmill.cli.app import COMMANDS, app
 from splatmill.schema import PROBLEMS, describe_options
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.plan.reasons import BY_OPTION
-from tests.support.documentation.markdown import blocks, without_blocks
+from tests.support.documentation.markdown import GUIDES, blocks, without_blocks
 from tests.support.paths import ROOT
 
 PAGES = [
     *sorted(ROOT.glob("*.md")),
-    *sorted((ROOT / "docs").glob("*.md")),
+    *GUIDES,
     *sorted(page for page in (ROOT / "worker").rglob("*.md") if "build" not in page.parts),
 ]
 

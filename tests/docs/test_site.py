@@ -14,6 +14,7 @@ import pytest
 from docs.generate import PAGES
 
 from splatmill.schema import PROBLEMS, describe_options
+from tests.support.documentation.markdown import FOLDERS, GUIDES
 from tests.support.paths import ROOT
 
 ASSETS = re.compile(r'<(?:script|img|source|iframe)\b[^>]*\ssrc="([^"]+)"|<link\b[^>]*\shref="([^"]+)"')
@@ -44,8 +45,14 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_every_page_is_there(site: Path) -> None:
-    pages = {page.stem for page in (ROOT / "docs").glob("*.md")}
-    assert pages == {page.stem for page in site.glob("*.html")} - {"genindex", "search", "py-modindex"}
+    built = {
+        page.relative_to(site).with_suffix("")
+        for folder in FOLDERS
+        for page in (site / folder).glob("*.html")
+    }
+    assert {page.relative_to(ROOT / "docs").with_suffix("") for page in GUIDES} == built - {
+        Path(name) for name in ("genindex", "search", "py-modindex")
+    }
     for name in set(PAGES) - {"python-errors.md", "formats.md"}:
         assert (site / "generated" / name).with_suffix(".html").is_file()
 
@@ -67,6 +74,6 @@ def test_generated_pages_hold_every_setting_and_code(site: Path) -> None:
 
 
 def test_pictures_are_small() -> None:
-    pictures = [path for path in (ROOT / "docs").iterdir() if path.suffix in (".png", ".jpg")]
+    pictures = [path for path in (ROOT / "docs" / "pictures").iterdir() if path.suffix in (".png", ".jpg")]
     assert pictures
     assert all(path.stat().st_size < 200_000 for path in pictures)

@@ -1,6 +1,7 @@
 """Proves that `splatmill_worker` offers the engine's names, each as its module defines it, and no others.
 
-What importing costs is proved by tests/test_architecture.py, and what the names do by docs/library.md, which is run.
+What importing costs is proved by tests/test_architecture.py, and what the names do by docs/programming/library.md,
+which is run.
 """
 
 import pytest

@@ -147,7 +147,7 @@ def exactness(rows: list[Row]) -> str:
 
 
 def summary(rows: list[Row]) -> list[str]:
-    """The table of docs/precision.md: the largest errors, in ulp, over all arguments that occur."""
+    """The table of docs/programming/precision.md: the largest errors, in ulp, over all arguments that occur."""
     builds = list(dict.fromkeys(row["build"] for row in measured(rows)))
     lines = [
         f"| function | used for | {' | '.join(builds)} | on any processor |",

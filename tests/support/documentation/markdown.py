@@ -13,6 +13,13 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+from tests.support.paths import ROOT
+
+FOLDERS = ("", "programming")
+"""Folders below docs/ with pages that people write."""
+
+GUIDES = sorted(page for folder in FOLDERS for page in (ROOT / "docs" / folder).glob("*.md"))
+
 _FENCE = re.compile(r"^(?P<fence>`{3,})(?P<language>[^\n`]*)\n(?P<text>.*?)^(?P=fence)\s*$", re.M | re.S)
 _MARK = re.compile(r"<!--\s*(?P<name>[a-z ]+?)(?::\s*(?P<value>[^>]*?))?\s*-->\s*\Z")
 

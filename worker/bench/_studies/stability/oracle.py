@@ -1,7 +1,7 @@
 """The image and its gradient in 50 decimal digits: how exact the float64 reference is that errors are counted from.
 
-Written from the formulas of docs/numerics.md, apart from the kernels' code. For about twenty Gaussians and a small
-image; gradients are central differences with a step of 1e-20, exact to some 30 digits.
+Written from the formulas of docs/programming/numerics.md, apart from the kernels' code. For about twenty Gaussians and
+a small image; gradients are central differences with a step of 1e-20, exact to some 30 digits.
 """
 
 from __future__ import annotations

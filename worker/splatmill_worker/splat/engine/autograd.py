@@ -21,7 +21,8 @@ class AutogradEngine:
     """An Engine over the reference's ops in float64: slow, with the steps that the fused engines should take.
 
     It takes no other backend: `cpu` and `gpu` pass conics of three float32 numbers from one separate op to the next,
-    from which a needle's gradient comes out with no right digit (docs/precision.md). Their fused steps train instead.
+    from which a needle's gradient comes out with no right digit (docs/programming/precision.md). Their fused steps
+    train instead.
 
     Adam updates all Gaussians; those that a photo does not show have a zero gradient. Scores are always kept, whatever
     `keep_scores` says, because autograd has them anyway.

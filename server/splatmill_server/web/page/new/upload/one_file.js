@@ -1,5 +1,5 @@
 // The upload of one file: in one request, or a large one in pieces that go on at the server's offset after any break
-// (docs/uploads.md). The same file is the same upload, so nothing has to be remembered to continue it.
+// (docs/programming/uploads.md). The same file is the same upload, so nothing has to be remembered to continue it.
 
 import { problemOfAnswer, transfer } from "./transfer.js";
 
