@@ -21,7 +21,7 @@ REDIS ?= $(shell command -v redis-server valkey-server | head -n 1)
 # Bytecode is kept, whatever the shell asks for: the tests start hundreds of processes, and each would compile its imports again.
 PYTEST := env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
-.PHONY: FORCE help install demo quick test redis fresh coverage check mutants wheels docs screenshots walk pictures bench soak capacity fleet load abuse fuzz serve sanitize clean
+.PHONY: FORCE help install demo quick test redis fresh coverage check ruff types rules mutants wheels docs screenshots walk pictures bench soak capacity fleet load abuse fuzz serve sanitize clean
 
 help: ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -51,10 +51,17 @@ fresh: ## make a bare Debian, and run `make demo` and `make test` there (as root
 coverage: $(VENV)/.installed-dev ## run all tests and print their coverage, which takes a good deal longer
 	$(PYTEST) --cov $(PYTEST_ARGS)
 
-check: mutants ## ruff, mypy, import rules, words, TypeScript over the web page, the list of mutations
+check: ruff types rules mutants ## ruff, mypy, import rules, words, TypeScript over the web page, the list of mutations
+
+ruff: $(VENV)/.installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+
+# mypy takes longer than all the others together, which run beside it with `make -j2 check`.
+types: $(VENV)/.installed-dev
 	$(BIN)/mypy
+
+rules: $(VENV)/.installed-dev
 	$(BIN)/lint-imports
 	$(BIN)/python -m tests.support.words
 	$(BIN)/python server/web/packages.py check
