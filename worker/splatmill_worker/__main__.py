@@ -81,6 +81,16 @@ def main(argv: list[str] | None = None) -> int:
     fit_image.add_argument("photo", type=Path)
     fit_image.add_argument("--out", type=Path, required=True, help="folder for the results")
     fit_image.add_argument("--options", default="{}", help="FitImageOptions as JSON")
+    plan = programs.add_parser("plan", help="make a plan of a scene in tiles")
+    plan.add_argument("folder", type=Path, help="folder of the plan, with the photos in capture/")
+    plan.add_argument("--options", default="{}", help="TrainOptions as JSON")
+    plan.add_argument("--tiles", type=int, required=True)
+    unit = programs.add_parser("unit", help="do one unit of a plan, or all that are left")
+    unit.add_argument("folder", type=Path)
+    unit.add_argument("name", nargs="?")
+    units = programs.add_parser("units", help="list the units of a plan")
+    units.add_argument("folder", type=Path)
+    units.add_argument("--json", action="store_true", help="print one JSON document instead of lines")
     doctor = programs.add_parser("doctor", help="check whether Splatmill runs on this machine")
     doctor.add_argument("--json", action="store_true", help="print one JSON document instead of lines")
     bench = programs.add_parser(
@@ -131,6 +141,16 @@ def main(argv: list[str] | None = None) -> int:
             from splatmill_worker.fit_image.command import main as fit_image_main
 
         return fit_image_main(chosen.photo, chosen.out, chosen.options)
+    if chosen.program in ("plan", "unit", "units"):
+        return_freed_memory()
+        with uncollected():
+            from splatmill_worker.tiles import command
+
+        if chosen.program == "plan":
+            return command.make_plan(chosen.folder, chosen.options, chosen.tiles)
+        if chosen.program == "unit":
+            return command.do_unit(chosen.folder, chosen.name)
+        return command.list_units(chosen.folder, as_json=chosen.json)
     if chosen.program == "doctor":
         from splatmill_worker.doctor import report
 

@@ -144,6 +144,10 @@ class Camera:
             self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y
         )
 
+    def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
+        """The same camera for `width` x `height` pixels of its photo, of which the first is at `left`, `top`."""
+        return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top)
+
 
 def viewmat_of(rotation: Float, center: Float) -> Float:
     """The world-to-camera matrix [4,4] of a camera with the world-to-camera `rotation` [3,3] at `center` [3]."""

@@ -13,6 +13,9 @@ from splatmill.cli.servers import with_profile
 # The module and function of each command.
 COMMANDS = {
     "train": ("splatmill.cli.commands.train", "train"),
+    "plan": ("splatmill.cli.commands.tiles", "plan"),
+    "unit": ("splatmill.cli.commands.tiles", "unit"),
+    "units": ("splatmill.cli.commands.tiles", "units"),
     "fit-image": ("splatmill.cli.commands.fit_image", "fit_image"),
     "options": ("splatmill.cli.commands.jobs", "options"),
     "jobs": ("splatmill.cli.commands.jobs", "jobs"),
@@ -47,7 +50,7 @@ COMMANDS = {
 
 # The commands under each heading of `splatmill --help`; those without one are under the last heading.
 HEADINGS = {
-    "Make a model": ("train", "fit-image", "options"),
+    "Make a model": ("train", "plan", "unit", "units", "fit-image", "options"),
     "Jobs on a server": (
         "jobs",
         "status",

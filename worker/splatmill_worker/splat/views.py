@@ -118,6 +118,16 @@ class TrainingView:
         self.levels.clear()
         self.levels[1] = full
 
+    def placed(self, files: PixelFiles) -> TrainingView:
+        """The view with its pixels in `files`."""
+        view = replace(self, files=files)
+        rgb, alpha, mask = (
+            None if plane is None else view._placed(plane)
+            for plane in (self.full.rgb, self.full.alpha, self.full.mask)
+        )
+        assert rgb is not None
+        return replace(view, levels={1: self.full._replace(rgb=rgb, alpha=alpha, mask=mask)})
+
     def _placed(self, plane: Tensor) -> Tensor:
         """The plane of a photo where its pixels lie."""
         return plane if self.files is None else torch.from_numpy(self.files.placed(plane.numpy()))

@@ -14,6 +14,9 @@ from ..morton import morton_order
 from . import blocks, engine
 from .loss import PhotoStats, photo_stats
 
+CLUSTER = 256
+"""Gaussians of a cluster, as in clusters.hpp."""
+
 
 class Visibility(NamedTuple):
     """What the last rendering counted.
@@ -51,9 +54,12 @@ class Step:
     steps leave out the clusters of 256 neighbours that cannot be in view; these make up for what they missed when they
     may be in view again, or are read. Not for use from two threads at once.
 
+    Gaussians of a context are rendered with the others, and nothing moves them: they hide and are hidden, but they have
+    no scores, no moments and no part in `count`, `parameters` or `moments`.
+
     threads: how many the passes use; results do not depend on it.
     clustered: whether steps leave out clusters that are not in view. To be changed before a `replace`.
-    count: number of Gaussians.
+    count: number of Gaussians, without those of the context.
     keep_scores: whether steps add to the densification scores.
     visibility: what the last rendering counted.
     pose_gradient: the camera's gradient of the last update; see `backward_update`.
@@ -61,7 +67,8 @@ class Step:
         `replace`.
     wave_gradient: the loss's gradient [M, 6] to the values of the waves of the last `train` or `backward_update`.
     blocks, exp_avg, exp_avg_sq: parameters and moments, float32 [ceil(N/16), 59, 16] (`blocks`); with `clustered`, in
-        an order of their own, and without the steps missed.
+        an order of their own, and without the steps missed. Those of a context stand behind the others, from a block,
+        or with `clustered` a cluster, of their own on.
     """
 
     def __init__(
@@ -74,11 +81,14 @@ class Step:
         *,
         threads: int | None = None,
         clustered: bool = False,
+        context: dict[str, Tensor] | None = None,
     ) -> None:
         """Take means [N,3], log_scales [N,3], quats [N,4], logit_opacities [N] and sh [N,16,3], float32 on the CPU.
 
-        threads: None is the affinity mask's and OMP_NUM_THREADS' number. Raises TypeError or ValueError that names the
-        argument.
+        threads: None is the affinity mask's and OMP_NUM_THREADS' number.
+        context: the same five tensors of the Gaussians that nothing moves, by name; None: there are none.
+
+        Raises TypeError or ValueError that names the argument.
         """
         self.threads = threads or engine.default_threads()
         if self.threads < 1:
@@ -95,6 +105,10 @@ class Step:
         self.waves: Waves | None = None
         self.wave_gradient: Tensor | None = None
         self._waved: int | None = None  # waves of the last rendering
+        self._context: dict[str, Tensor] | None = None
+        if context is not None and len(context["means"]):
+            self._context = {name: context[name].detach() for name in blocks.FIRST}
+            checks.gaussians(*self._context.values(), coefficients=16)
         self.replace(
             {
                 "means": means,
@@ -121,23 +135,49 @@ class Step:
             if moment is not None:
                 checks.tensor(name, moment, (count, PARAMETERS))
         self.count = count
-        means = ordered["means"].detach()
-        order = self._order = (
-            morton_order(means.nan_to_num(0.0, 0.0, 0.0), cubic=True) if self.clustered else None
-        )
-        self.blocks = blocks.pack(ordered, count, self.threads, order)
+        self._moved: int | None = None
+        if self._context is None:
+            self._rows, order = count, self._order_of(ordered["means"])
+        else:
+            unused = -count % (CLUSTER if self.clustered else blocks.LANES)
+            ordered = {
+                name: torch.cat(
+                    [value.detach(), value.new_zeros(unused, *value.shape[1:]), self._context[name]]
+                )
+                for name, value in ordered.items()
+            }
+            self._rows, self._moved = len(ordered["means"]), (count + unused) // blocks.LANES
+            order = self._order_with_context(ordered["means"], count, count + unused)
+            exp_avg, exp_avg_sq = (
+                None
+                if moment is None
+                else torch.cat([moment, moment.new_zeros(self._rows - count, PARAMETERS)])
+                for moment in (exp_avg, exp_avg_sq)
+            )
+        self._order = order
+        self.blocks = blocks.pack(ordered, self._rows, self.threads, order)
         self.exp_avg, self.exp_avg_sq = (
-            blocks.empty(count) if moment is None else blocks.pack_rows(moment, self.threads, order)
+            blocks.empty(self._rows) if moment is None else blocks.pack_rows(moment, self.threads, order)
             for moment in (exp_avg, exp_avg_sq)
         )
-        self._clusters = engine.Clusters(*self._state, count, self.threads) if self.clustered else None
+        self._clusters = engine.Clusters(*self._state, self._rows, self.threads) if self.clustered else None
         self._scores = torch.zeros(3, len(self.blocks) * blocks.LANES)
         self._rendered = False
+
+    def _order_of(self, means: Tensor) -> Tensor | None:
+        return morton_order(means.detach().nan_to_num(0.0, 0.0, 0.0), cubic=True) if self.clustered else None
+
+    def _order_with_context(self, means: Tensor, count: int, first: int) -> Tensor | None:
+        """The order of `count` Gaussians, of the rows without a Gaussian before row `first`, and of the context."""
+        free, context = self._order_of(means[:count]), self._order_of(means[first:])
+        if free is None or context is None:
+            return None
+        return torch.cat([free, torch.arange(count, first), first + context])
 
     def parameters(self) -> dict[str, Tensor]:
         """Return copies of the parameters, [N, ...] each, under the names of the constructor."""
         self._settle()
-        n = self.count
+        n = self._rows
         shapes = {
             "means": (n, 3),
             "log_scales": (n, 3),
@@ -146,15 +186,17 @@ class Step:
             "sh": (n, 16, 3),
         }
         sizes = {k: torch.Size(s) for k, s in shapes.items()}
-        return blocks.unpack(self.blocks, sizes, n, self.threads, self._order)
+        groups = blocks.unpack(self.blocks, sizes, n, self.threads, self._order)
+        return groups if self._context is None else {k: v[: self.count].clone() for k, v in groups.items()}
 
     def moments(self) -> tuple[Tensor, Tensor]:
         """Return copies of Adam's first and second moments, [N, 59] each; columns in the order of `records.GROUPS`."""
         self._settle()
-        return (
-            blocks.unpack_rows(self.exp_avg, self.count, self.threads, self._order),
-            blocks.unpack_rows(self.exp_avg_sq, self.count, self.threads, self._order),
+        first, second = (
+            blocks.unpack_rows(rows, self._rows, self.threads, self._order)[: self.count]
+            for rows in (self.exp_avg, self.exp_avg_sq)
         )
+        return first, second
 
     @property
     def share_computed(self) -> float:
@@ -194,8 +236,10 @@ class Step:
         return self._score(2)
 
     def _score(self, number: int) -> Tensor:
-        score = self._scores[number, : self.count]
-        return score if self._order is None else torch.empty_like(score).index_copy_(0, self._order, score)
+        score = self._scores[number, : self._rows]
+        if self._order is not None:
+            score = torch.empty_like(score).index_copy_(0, self._order, score)
+        return score[: self.count]
 
     # ---- the step
 
@@ -250,8 +294,11 @@ class Step:
         gradient = self._take_gradient(d_color, d_alpha, d_depth)
         out = torch.empty_like(self.blocks)
         engine.gradients(self._frame, self.blocks, self._degree, self._image, gradient, out, self.threads)
-        shapes = {name: value.shape for name, value in self.parameters().items()}
-        return blocks.unpack(out, shapes, self.count, self.threads, self._order)
+        shapes = {
+            name: torch.Size((self._rows, *value.shape[1:])) for name, value in self.parameters().items()
+        }
+        groups = blocks.unpack(out, shapes, self._rows, self.threads, self._order)
+        return {name: value[: self.count] for name, value in groups.items()}
 
     def train(
         self,
@@ -310,6 +357,8 @@ class Step:
         checks.camera(viewmat, K, width, height, degree, near, background)
         self._rendered = False  # until it is: an error leaves the frame's lists half made
         if self.waves is not None:
+            if self._context is not None:
+                raise ValueError("waves: they are for Gaussians without a context; leave out one of the two")
             checks.waves(self.waves, self.count)
         shape = (planes, -(-height // TILE) * TILE, -(-width // TILE) * TILE)
         if self._image.shape != shape:
@@ -321,7 +370,7 @@ class Step:
         seen = engine.render(
             self._frame,
             self.blocks,
-            self.count,
+            self._rows,
             degree,
             camera,
             color,
@@ -355,6 +404,8 @@ class Step:
     def _update(self, gradient: Tensor, rates: Rates, step: int, pose_gradient: bool) -> int:
         if step < 1:
             raise ValueError(f"step: counts from 1, got {step}")
+        if pose_gradient and self._context is not None:
+            raise ValueError("pose_gradient: a context has no part in it; leave out one of the two")
         self.pose_gradient = torch.empty(6) if pose_gradient else None
         self.wave_gradient = None if self._waved is None else torch.zeros(self._waved, 6)
         refused: int = engine.update(
@@ -373,6 +424,7 @@ class Step:
             self.pose_gradient,
             self._clusters,
             self.wave_gradient,
+            self._moved,
         )
         self._rendered = False  # the rendering shows the Gaussians before they moved
         return refused

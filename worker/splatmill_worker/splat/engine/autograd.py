@@ -10,7 +10,7 @@ from torch import Tensor
 from splatmill_worker.kernels import ops
 from splatmill_worker.kernels.records import BETA1, EPS, Rates
 from splatmill_worker.splat.engine.protocol import StepResult
-from splatmill_worker.splat.gaussians import Gaussians
+from splatmill_worker.splat.gaussians import Gaussians, concatenate
 from splatmill_worker.splat.motion import motion
 from splatmill_worker.splat.views import over
 
@@ -26,9 +26,12 @@ class AutogradEngine:
 
     Adam updates all Gaussians; those that a photo does not show have a zero gradient. Scores are always kept, whatever
     `keep_scores` says, because autograd has them anyway.
+
+    context: Gaussians that are rendered with the others, and that nothing moves.
     """
 
-    def __init__(self, gaussians: Gaussians) -> None:
+    def __init__(self, gaussians: Gaussians, *, context: Gaussians | None = None) -> None:
+        self._context = None if context is None else context.padded(3).map(lambda value: value.double())
         self.keep_scores = True
         self.keep_pose_gradient = False
         self.pose_gradient: Tensor | None = None
@@ -75,7 +78,7 @@ class AutogradEngine:
         background: Tensor | None = None,
         antialias: bool = False,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        gaussians = self._gaussians
+        gaussians = self._gaussians if self._context is None else concatenate(self._gaussians, self._context)
         self._twist = None
         if self.keep_pose_gradient and torch.is_grad_enabled():
             self._twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
@@ -162,11 +165,11 @@ class AutogradEngine:
         if gradient is None:
             return
         with torch.no_grad():
-            visible = projected.extents[:, 0] > 0
-            ndc = gradient * gradient.new_tensor([width / 2, height / 2])
+            visible = projected.extents[: self.count, 0] > 0
+            ndc = gradient[: self.count] * gradient.new_tensor([width / 2, height / 2])
             self.plain_sum += torch.linalg.vector_norm(ndc, dim=1)
             self.visible_count += visible
-            extent = 2.0 * projected.extents.amax(dim=1).float() / max(width, height)
+            extent = 2.0 * projected.extents[: self.count].amax(dim=1).float() / max(width, height)
             self.max_extent = torch.maximum(self.max_extent, extent)
 
     def _adam(self, rates: Rates, step: int) -> None:

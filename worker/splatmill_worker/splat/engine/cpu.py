@@ -20,11 +20,23 @@ KEPT_BYTES = 400 * 10**6
 class CpuEngine(Step):
     """An Engine on the C++ kernels, with as many threads as the kernels choose where `threads` is None.
 
-    clustered: as in `Step`.
+    clustered, context: as in `Step`.
     """
 
-    def __init__(self, gaussians: Gaussians, *, threads: int | None = None, clustered: bool = False) -> None:
-        super().__init__(**gaussians.padded(3).parameters(), threads=threads, clustered=clustered)
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        *,
+        threads: int | None = None,
+        clustered: bool = False,
+        context: Gaussians | None = None,
+    ) -> None:
+        super().__init__(
+            **gaussians.padded(3).parameters(),
+            threads=threads,
+            clustered=clustered,
+            context=None if context is None else context.padded(3).parameters(),
+        )
         self.keep_pose_gradient = False
         self._kept: dict[Hashable, PhotoStats] = {}
         self._kept_bytes = 0

@@ -132,11 +132,12 @@ int64_t update_block(const Frame& frame, const ImageGradient& g, const Scene& sc
   }
 }
 
-// Updates all blocks, or with `clusters` those of the chosen ones, of which one task updates one and adds up its camera gradients.
+// Updates the blocks before `end`, or with `clusters` those of the chosen ones, of which one task updates one and adds up its camera
+// gradients.
 // With kPose, writes the sums [kPoseSums] of the camera's gradient to `pose`.
 template <bool kAdam, bool kPose>
 int64_t update_scene(Frame& frame, const ImageGradient& g, const Scene& scene, const Update& update, double* pose, int threads,
-                     Clusters* clusters = nullptr) {
+                     int64_t end, Clusters* clusters = nullptr) {
   const Visited visited(frame.count, clusters);
   const int64_t n = visited.blocks(), chunks = (n + kClusterBlocks - 1) / kClusterBlocks;
   double* partial = kPose ? frame.pose_sums.reserve(chunks * kPoseSums) : nullptr;
@@ -149,7 +150,7 @@ int64_t update_scene(Frame& frame, const ImageGradient& g, const Scene& scene, c
       double* sums = kPose ? partial + chunk * kPoseSums : nullptr;
       if constexpr (kPose) std::fill_n(sums, kPoseSums, 0.0);
       for (int64_t i = chunk * kClusterBlocks; i < std::min(n, (chunk + 1) * kClusterBlocks); ++i)
-        refused += update_block<kAdam, kPose>(frame, g, scene, update, visited.block(i), sums);
+        if (visited.block(i) < end) refused += update_block<kAdam, kPose>(frame, g, scene, update, visited.block(i), sums);
       if (clusters) clusters->moved(update.state, clusters->chosen()[chunk]);
     }
   }
@@ -205,7 +206,7 @@ void bind_step(nb::module_& m) {
       "update",
       [](Frame& frame, Blocks params, Blocks exp_avg, Blocks exp_avg_sq, int degree, Image image, Image gradient,
          const std::vector<float>& rates, double beta2, int64_t step, std::optional<ScoreRows> scores, int threads,
-         std::optional<Twist> pose, Clusters* clusters, std::optional<Rows<kWaveFloats>> d_waves) {
+         std::optional<Twist> pose, Clusters* clusters, std::optional<Rows<kWaveFloats>> d_waves, std::optional<int64_t> moved) {
         Update update;
         update.state = {params.data(), exp_avg.data(), exp_avg_sq.data()};
         update.adam = AdamStep(step, beta2);
@@ -224,13 +225,14 @@ void bind_step(nb::module_& m) {
           for (int rate = 0; rate < kRates; ++rate) by_group[rate] = rates.at(kRateRows[rate]);
           clusters->advance(update.state, by_group, step, beta2, rows_of(degree), threads);
         }
+        const int64_t end = moved.value_or(blocks_for(frame.count));
         int64_t refused;
         if (pose) {
           double sums[kPoseSums];
-          refused = update_scene<true, true>(frame, g, scene, update, sums, threads, clusters);
+          refused = update_scene<true, true>(frame, g, scene, update, sums, threads, end, clusters);
           motion_gradient(frame.camera, sums, pose->data());
         } else {
-          refused = update_scene<true, false>(frame, g, scene, update, nullptr, threads, clusters);
+          refused = update_scene<true, false>(frame, g, scene, update, nullptr, threads, end, clusters);
         }
         frame.seconds.update = watch.lap();
         return refused;
@@ -238,10 +240,10 @@ void bind_step(nb::module_& m) {
       "frame"_a, "params"_a.noconvert(), "exp_avg"_a.noconvert(), "exp_avg_sq"_a.noconvert(), "degree"_a,
       "image"_a.noconvert(), "gradient"_a.noconvert(), "rates"_a, "beta2"_a, "step"_a,
       "scores"_a.noconvert().none(), "threads"_a, "pose"_a.noconvert().none() = nb::none(), "clusters"_a.none() = nb::none(),
-      "d_waves"_a.noconvert().none() = nb::none(),
+      "d_waves"_a.noconvert().none() = nb::none(), "moved"_a.none() = nb::none(),
       "Backward pass of the last render and one Adam step; returns how many gradient values were refused as not finite. Adds to "
       "`scores` [3, Gaussians] and fills `pose` [6] with the gradient to a motion of the camera (pose.hpp), where given. With "
-      "`clusters`, which `render` was given too, moves those chosen last.");
+      "`clusters`, which `render` was given too, moves those chosen last. With `moved`, only blocks before that number are moved.");
   m.def(
       "gradients",
       [](Frame& frame, Blocks params, int degree, Image image, Image gradient, Blocks gradients, int threads) {
@@ -250,7 +252,7 @@ void bind_step(nb::module_& m) {
         const ImageGradient g{planes_of(image, frame.camera), planes_of(gradient, frame.camera), gradient.shape(0) == 5};
         nb::gil_scoped_release release;
         composite_backward(frame, g, threads);
-        update_scene<false, false>(frame, g, {params.data(), degree}, update, nullptr, threads);
+        update_scene<false, false>(frame, g, {params.data(), degree}, update, nullptr, threads, blocks_for(frame.count));
       },
       "frame"_a, "params"_a.noconvert(), "degree"_a, "image"_a.noconvert(), "gradient"_a.noconvert(), "gradients"_a.noconvert(),
       "threads"_a, "Backward pass of the last render; writes the gradients to the parameters into blocks.");

@@ -1,0 +1,108 @@
+"""`splatmill plan`, `unit` and `units`: a scene in tiles, on this machine or on all that share a folder."""
+
+import os
+import shutil
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from splatmill.cli.local.programs import exec_module, require
+from splatmill.cli.schema_options import with_training_options
+from splatmill.errors import NothingToUpload
+from splatmill.schema import format_bytes
+from splatmill.transfer.local_capture import LocalFile, find_files, printable
+from splatmill.transfer.training_options import train_options
+
+CAPTURE = "capture"
+"""Folder of the photos in the folder of a plan."""
+
+
+@with_training_options
+def plan(
+    path: Annotated[
+        Path,
+        typer.Argument(
+            metavar="PATH",
+            help="Folder of photos, zip archive, video, or posed data set.",
+            show_default=False,
+        ),
+    ],
+    out: Annotated[
+        Path,
+        typer.Option(
+            "-o", "--out", metavar="DIR", help="Folder of the plan; created if missing.", show_default=False
+        ),
+    ],
+    tiles: Annotated[int, typer.Option(min=2, help="Number of tiles that the scene is trained in.")] = 4,
+    **options: Any,
+) -> None:
+    """Plan a scene in tiles: cameras, a coarse model, tiles, and the model that they make, each a unit in DIR.
+
+    `splatmill unit DIR` does the units, on this machine and on every other that sees DIR. A plan that is made again
+    with other options keeps what does not depend on them.
+    """
+    arguments = {key: value for key, value in options.items() if value is not None and value != []}
+    checked = train_options(arguments)
+    capture_files = find_files(path)
+    if capture_files.is_one_photo:
+        raise NothingToUpload(
+            f"{printable(capture_files.files[0].name)} is one photo; depth cannot be recovered from a single photo.",
+            "Give a folder with 20 or more photos from different places, a video, or a zip archive.",
+        )
+    require("splatmill_worker", "Planning a scene")
+    typer.echo(f"{', '.join(capture_files.contents())}, {format_bytes(capture_files.bytes)}")
+    for sentence in capture_files.remarks:
+        typer.echo(printable(sentence), err=True)
+    _copy(capture_files.files, out / CAPTURE)
+    exec_module(
+        "splatmill_worker",
+        "plan",
+        "--tiles",
+        str(tiles),
+        "--options",
+        checked.model_dump_json(),
+        "--",
+        str(out),
+    )
+
+
+def unit(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a plan.", show_default=False)],
+    name: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="UNIT",
+            help="Name of the unit. Left out, units are done until the scene is, beside other processes that do the "
+            "same.",
+            show_default=False,
+        ),
+    ] = None,
+) -> None:
+    """Do one unit of a plan, or all that are left."""
+    require("splatmill_worker", "Training a scene")
+    exec_module("splatmill_worker", "unit", "--", str(folder), *([] if name is None else [name]))
+
+
+def units(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a plan.", show_default=False)],
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document.")] = False,
+) -> None:
+    """List the units of a plan: which are done, failed, running, ready, or wait for others."""
+    require("splatmill_worker", "Reading a plan")
+    exec_module("splatmill_worker", "units", *(["--json"] if as_json else []), "--", str(folder))
+
+
+def _copy(files: tuple[LocalFile, ...], capture: Path) -> None:
+    """Make `capture` the folder of these files and no others, with links where the file system has them."""
+    new = capture.with_name(f"{capture.name}.new")
+    shutil.rmtree(new, ignore_errors=True)
+    for file in files:
+        target = new / file.role.value / file.name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            os.link(file.path, target)
+        except OSError:  # another file system, or one without links
+            shutil.copyfile(file.path, target)
+    shutil.rmtree(capture, ignore_errors=True)
+    new.rename(capture)

@@ -1,0 +1,181 @@
+"""Processes that share a plan's folder: one runs a unit at a time, an output appears whole, and nothing that a killed
+or frozen process leaves stops the others.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from splatmill.schema import TrainOptions
+from splatmill_worker.errors import Refusal
+from splatmill_worker.tiles.folder import CLAIM_SECONDS, Claimed, PlanFolder, digest_of
+from splatmill_worker.tiles.units import ScenePlan
+
+
+@pytest.fixture
+def shared(tmp_path: Path) -> PlanFolder:
+    made = PlanFolder(tmp_path / "plan", ScenePlan("d", TrainOptions(), 2))
+    made.save()
+    return PlanFolder.open(tmp_path / "plan")
+
+
+def do(shared: PlanFolder, name: str, text: str = "x") -> None:
+    with shared.claimed(name) as run:
+        run.out.mkdir()
+        (run.out / "file").write_text(text)
+        run.publish({"seconds": 1.0})
+
+
+def claim_of(shared: PlanFolder) -> Path:
+    (claim,) = (shared.root / "units").glob("*.claim")
+    return claim
+
+
+def make_old(claim: Path) -> None:
+    """Let a claim be as old as that of a machine that went away."""
+    then = time.time() - CLAIM_SECONDS - 5
+    os.utime(claim, (then, then))
+
+
+def test_units_end_in_their_order_and_leave_only_outputs(shared: PlanFolder) -> None:
+    assert shared.ended() == {}
+    for name in ("cameras", "coarse", "tile-1", "tile-2", "scene"):
+        assert name in shared.plan.ready(shared.states())
+        do(shared, name)
+    assert set(shared.states().values()) == {"done"}
+    left = {path.name.rpartition("-")[0] for path in (shared.root / "units").iterdir()}
+    assert left == {"cameras", "coarse", "tile-1", "tile-2", "scene"}
+    assert len(list((shared.root / "units").iterdir())) == 5
+
+
+def test_a_unit_that_another_process_runs_is_claimed(shared: PlanFolder) -> None:
+    with shared.claimed("cameras") as run:
+        assert shared.running("cameras") == f"{os.uname().nodename}, process {os.getpid()}"
+        with pytest.raises(Claimed), shared.claimed("cameras"):
+            pass
+        assert run.held()
+    assert shared.running("cameras") is None
+    with shared.claimed("cameras"):
+        pass
+
+
+def test_a_claim_of_a_killed_process_of_this_machine_is_free_at_once(shared: PlanFolder) -> None:
+    code = (
+        "import os, sys; from pathlib import Path; from splatmill_worker.tiles.folder import PlanFolder\n"
+        "with PlanFolder.open(Path(sys.argv[1])).claimed('cameras') as run:\n"
+        "    (run.work / 'half').write_text('x'); os.kill(os.getpid(), 9)"
+    )
+    killed = subprocess.run([sys.executable, "-c", code, str(shared.root)], check=False)
+    assert killed.returncode == -9
+    assert claim_of(shared).exists()
+    assert shared.running("cameras") is None
+    do(shared, "cameras")
+    assert len(list((shared.root / "units").iterdir())) == 1
+
+
+def test_a_claim_of_another_machine_holds_while_it_is_renewed(shared: PlanFolder) -> None:
+    (shared.root / "units").mkdir()
+    claim = shared.root / "units" / f"cameras-{shared.plan.key('cameras', {})}.claim"
+    claim.write_text(json.dumps({"token": "t", "host": "elsewhere", "namespace": "", "pid": 1, "started": 0}))
+    with pytest.raises(Claimed):
+        do(shared, "cameras")
+    assert shared.running("cameras") == "elsewhere, process 1"
+    make_old(claim)
+    assert shared.running("cameras") is None
+    do(shared, "cameras")
+
+
+def test_a_frozen_process_loses_its_unit_and_changes_nothing_afterwards(shared: PlanFolder) -> None:
+    with PlanFolder(shared.root, shared.plan, beat_seconds=1e6).claimed("cameras") as frozen:
+        make_old(claim_of(shared))
+        frozen.out.mkdir()
+        (frozen.out / "file").write_text("late")
+        with shared.claimed("cameras") as other:
+            assert not frozen.work.exists()  # what the frozen one had is gone, so that it cannot go on
+            other.out.mkdir()
+            (other.out / "file").write_text("other")
+            other.publish({"seconds": 1.0})
+    path = shared.ended()["cameras"].path
+    assert path is not None
+    assert (path / "file").read_text() == "other"
+
+
+def test_a_process_notices_that_its_unit_is_anothers(shared: PlanFolder) -> None:
+    with PlanFolder(shared.root, shared.plan, beat_seconds=0.05).claimed("cameras") as run:
+        claim_of(shared).write_text(json.dumps({"token": "another"}))
+        end = time.monotonic() + 20
+        while run.held() and time.monotonic() < end:
+            time.sleep(0.02)
+        assert not run.held()
+        run.fail("It failed.", "")
+    assert shared.ended() == {}
+    assert claim_of(shared).exists()
+
+
+def test_the_second_of_two_outputs_is_dropped(shared: PlanFolder) -> None:
+    with shared.claimed("cameras") as run:
+        run.out.mkdir()
+        (run.out / "file").write_text("second")
+        run.path.mkdir()
+        (run.path / "file").write_text("first")
+        (run.path / "done.json").write_text("{}")
+        run.publish({})
+    path = shared.ended()["cameras"].path
+    assert path is not None
+    assert (path / "file").read_text() == "first"
+
+
+def test_a_failure_is_kept_until_it_is_forgotten(shared: PlanFolder) -> None:
+    do(shared, "cameras")
+    do(shared, "coarse")
+    do(shared, "tile-2")
+    with shared.claimed("tile-1") as run:
+        run.fail("Training diverged.", "Try another seed.")
+    ended = shared.ended()["tile-1"]
+    assert (ended.state, ended.failure, ended.advice) == ("failed", "Training diverged.", "Try another seed.")
+    assert shared.plan.ready(shared.states()) == ["scene"]
+    do(shared, "scene", "partial")
+    partial = shared.ended()["scene"].path
+    shared.forget_failure("tile-1")
+    assert shared.plan.ready(shared.states()) == ["tile-1"]
+    do(shared, "tile-1")
+    assert shared.plan.ready(shared.states()) == ["scene"]
+    do(shared, "scene", "whole")
+    whole = shared.ended()["scene"].path
+    assert whole is not None
+    assert whole != partial
+    assert (whole / "file").read_text() == "whole"
+
+
+def test_a_digest_follows_from_names_and_contents(tmp_path: Path) -> None:
+    def digest(files: dict[str, str]) -> str:
+        root = tmp_path / str(len(list(tmp_path.iterdir())))
+        for name, text in files.items():
+            (root / name).parent.mkdir(parents=True, exist_ok=True)
+            (root / name).write_text(text)
+        return digest_of(root)
+
+    one = digest({"images/a": "1", "images/b": "2"})
+    assert digest({"images/b": "2", "images/a": "1"}) == one
+    assert (
+        len({one, digest({"images/a": "2", "images/b": "1"}), digest({"images/a": "1", "images/c": "2"})})
+        == 3
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [(None, "has no plan.json"), ("{", "not a plan"), ("[]", "not a plan"), ('{"format": 7}', "format 7")],
+)
+def test_a_folder_without_a_plan_is_refused(tmp_path: Path, text: str | None, said: str) -> None:
+    if text is not None:
+        (tmp_path / "plan.json").write_text(text)
+    with pytest.raises(Refusal, match=said):
+        PlanFolder.open(tmp_path)

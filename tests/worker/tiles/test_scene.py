@@ -1,0 +1,224 @@
+"""A scene in tiles, from photos to its model: as good as in one piece, the same bytes whoever does the units and
+whatever happens to them, and usable where a tile failed.
+
+Does not prove quality on real captures (`worker/bench/tiles.md`), nor SfM (its own tests do).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from splatmill.schema import ModelCameras, Report, TrainOptions
+from splatmill_worker import pipeline
+from splatmill_worker.splat.formats import registry
+from splatmill_worker.tiles import command
+from splatmill_worker.tiles.folder import PlanFolder
+from tests.support import still_life
+from tests.support.made_once import made_once
+
+pytestmark = pytest.mark.slow
+
+OPTIONS = TrainOptions.model_validate({"steps": 200, "seed": 1, "max_gaussians": 3000, "holdout": 5})
+TILES = 2
+
+
+def new_plan(root: Path) -> Path:
+    still_life.posed_capture(root / "capture")
+    assert command.make_plan(root, OPTIONS.model_dump_json(), TILES) == 0
+    return root
+
+
+def program(*arguments: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "splatmill_worker", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def done(*arguments: str) -> str:
+    process = program(*arguments)
+    text, _ = process.communicate(timeout=250)
+    assert process.returncode == 0, text
+    return text
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A plan all of whose units were done by one process after the other."""
+
+    def make(root: Path) -> None:
+        new_plan(root)
+        done("unit", str(root))
+
+    return made_once(tmp_path_factory, "scene-in-tiles", make)
+
+
+def copied(whole: Path, to: Path, without: tuple[str, ...] = ()) -> Path:
+    """A copy of a plan, without the outputs of some units."""
+    shutil.copytree(whole, to, symlinks=True)
+    for path in (to / "units").iterdir():
+        if path.name.rpartition("-")[0] in without:
+            shutil.rmtree(path)
+    if "scene" in without:
+        (to / "scene").unlink()
+    return to
+
+
+def model_of(root: Path) -> bytes:
+    return (root / "scene" / "model.ply").read_bytes()
+
+
+def test_the_scene_is_as_good_as_in_one_piece(whole: Path, tmp_path: Path) -> None:
+    outcome = pipeline.run(whole / "capture", tmp_path, OPTIONS, lambda event: None, lambda: False)
+    assert outcome.trained is not None
+    assert outcome.trained.held_out is not None
+    ended = PlanFolder.open(whole).ended()
+    facts = {
+        name: json.loads((end.path / "done.json").read_text())
+        for name, end in ended.items()
+        if end.path is not None
+    }
+    assert facts["scene"]["psnr"] > outcome.trained.held_out.psnr - 0.3
+    assert facts["scene"]["psnr"] > facts["coarse"]["psnr"]
+    assert facts["scene"]["failed"] == []
+    seams = facts["scene"]["seams"]
+    assert 0.0 < seams["share"] < 1.0
+    assert seams["seams"] > seams["coarse_seams"] - 0.2
+    assert facts["scene"]["gaussians"] == sum(facts[f"tile-{number}"]["gaussians"] for number in (1, 2))
+    assert min(facts[f"tile-{number}"]["gaussians"] for number in (1, 2)) > 200
+
+
+def test_the_scene_has_the_files_of_a_training(whole: Path) -> None:
+    out = whole / "scene"
+    report = json.loads((out / "report.json").read_text())
+    checked = Report.model_validate(report)
+    assert checked.curve[-1].psnr == pytest.approx(report["result"]["psnr"])
+    assert [row.step for row in checked.curve] == sorted(row.step for row in checked.curve)
+    assert report["plan"]["max_gaussians"] == OPTIONS.max_gaussians
+    assert "2 tiles" in report["plan"]["reasons"]["max_gaussians"]
+    assert report["result"]["gaussians"] == registry.read(out / "model.ply").gaussians.count
+    cameras = ModelCameras.model_validate_json((out / "cameras.json").read_text())
+    assert len(cameras.cameras) == still_life.COUNT
+    assert (out / "report.html").stat().st_size > 10_000
+    assert (out / "cameras.zip").is_file()
+
+
+def test_the_bytes_are_the_same_whoever_does_the_units_and_one_of_them_is_killed(
+    whole: Path, tmp_path: Path
+) -> None:
+    root = copied(whole, tmp_path / "plan", without=("tile-1", "tile-2", "scene"))
+    killed = program("unit", str(root), "tile-1")
+    claims = root / "units"
+    end = time.monotonic() + 100
+    while not list(claims.glob("tile-1*.claim")) and time.monotonic() < end:
+        time.sleep(0.05)
+    time.sleep(0.5)
+    killed.send_signal(signal.SIGKILL)
+    killed.communicate()
+    both = [program("unit", str(root)) for _ in range(2)]
+    texts = [process.communicate(timeout=250)[0] for process in both]
+    assert [process.returncode for process in both] == [0, 0], texts
+    assert model_of(root) == model_of(whole)
+    assert len(list(claims.iterdir())) == 5, "nothing but outputs is left"
+
+
+def test_a_unit_that_is_stopped_is_free_and_its_partners_are_kept(whole: Path, tmp_path: Path) -> None:
+    root = copied(whole, tmp_path / "plan", without=("tile-2", "scene"))
+    process = program("unit", str(root))
+    end = time.monotonic() + 100
+    while not list((root / "units").glob("tile-2*.claim")) and time.monotonic() < end:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGTERM)
+    text, _ = process.communicate(timeout=100)
+    assert process.returncode == 130, text
+    assert "kept" in text
+    folder = PlanFolder.open(root)
+    assert folder.plan.ready(folder.states()) == ["tile-2"]
+    assert folder.running("tile-2") is None
+
+
+def test_a_failed_tile_leaves_a_scene_with_the_coarse_model_in_its_place(whole: Path, tmp_path: Path) -> None:
+    root = copied(whole, tmp_path / "plan", without=("tile-1", "scene"))
+    folder = PlanFolder.open(root)
+    with folder.claimed("tile-1") as run:
+        run.fail("Training diverged.", "Try another seed.")
+    text = done("unit", str(root))
+    assert "tile-1     failed    Training diverged. Try another seed." in text
+    report = json.loads((root / "scene" / "report.json").read_text())
+    (warning,) = (each for each in report["warnings"] if "Tile 1 of 2" in each)
+    assert "coarse model" in warning
+    assert model_of(root) != model_of(whole)
+    # Done by its name, the tile takes its place.
+    done("unit", str(root), "tile-1")
+    done("unit", str(root))
+    assert model_of(root) == model_of(whole)
+
+
+def test_another_option_repeats_only_what_depends_on_it(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = copied(whole, tmp_path / "plan")
+    assert command.make_plan(root, OPTIONS.model_copy(update={"steps": 60}).model_dump_json(), TILES) == 0
+    assert "done already: cameras" in capsys.readouterr().out
+    assert PlanFolder.open(root).states() == {"cameras": "done"}
+    assert command.make_plan(root, OPTIONS.model_dump_json(), TILES) == 0
+    assert len(PlanFolder.open(root).states()) == 5
+
+
+def test_units_are_listed(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root = copied(whole, tmp_path / "plan", without=("tile-1", "scene"))
+    with PlanFolder.open(root).claimed("tile-1"):
+        assert command.list_units(root, as_json=True) == 0
+        rows = {row["unit"]: row for row in json.loads(capsys.readouterr().out)}
+    assert {name: row["state"] for name, row in rows.items()} == {
+        "cameras": "done", "coarse": "done", "tile-1": "running", "tile-2": "done", "scene": "waiting",
+    }  # fmt: skip
+    assert rows["tile-1"]["why"] == f"{os.uname().nodename}, process {os.getpid()}"
+    assert rows["scene"]["why"] == "needs tile-1"
+    assert rows["coarse"]["psnr"] > 15
+    assert command.do_unit(root, "scene") == command.REFUSED
+    assert "scene needs tile-1 first" in capsys.readouterr().err
+    assert command.do_unit(root, "tile-9") == command.REFUSED
+    assert "Its units are cameras, coarse, tile-1" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"time_budget": 60},
+        {"within": 600},
+        {"progress_video": "orbit"},
+        {"time_lapse": "on"},
+        {"start": "a.ply"},
+    ],
+)
+def test_options_of_a_training_in_one_piece_are_refused(
+    given: dict[str, object], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    still_life.posed_capture(tmp_path / "capture")
+    asked = TrainOptions.model_validate(given)
+    assert command.make_plan(tmp_path, asked.model_dump_json(), 2) == command.REFUSED
+    assert f"The option {next(iter(given))} is for" in capsys.readouterr().err
+    assert not (tmp_path / "plan.json").exists()
+
+
+def test_a_capture_without_cameras_fails_once_and_says_why(tmp_path: Path) -> None:
+    (tmp_path / "capture" / "images").mkdir(parents=True)
+    (tmp_path / "capture" / "images" / "a.txt").write_text("no photo")
+    assert command.make_plan(tmp_path, OPTIONS.model_dump_json(), 2) == 0
+    process = program("unit", str(tmp_path))
+    text, _ = process.communicate(timeout=100)
+    assert process.returncode == command.FAILED
+    assert "cameras    failed" in text
+    assert "coarse     waiting   needs cameras" in text

@@ -1,0 +1,64 @@
+"""What is ready follows from the plan and from what has ended, in any order, and keys follow from what matters."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+
+from splatmill.schema import TrainOptions
+from splatmill_worker.tiles.units import CAMERA_OPTIONS, ScenePlan, State
+
+
+def plan(tiles: int = 4, digest: str = "d", **options: object) -> ScenePlan:
+    return ScenePlan(digest, TrainOptions.model_validate(options), tiles)
+
+
+@pytest.mark.parametrize("seed", range(50))
+def test_a_walk_in_any_order_ends_with_the_scene_unless_what_it_needs_failed(seed: int) -> None:
+    choose = random.Random(seed)
+    scene = plan(choose.randint(2, 9))
+    states: dict[str, State] = {}
+    while ready := scene.ready(states):
+        for name in ready:
+            unit = scene.unit(name)
+            assert all(states.get(need) == "done" or need in unit.spares for need in unit.needs)
+            assert all(need in states for need in unit.needs)
+        name = choose.choice(ready)
+        states[name] = "failed" if choose.random() < 0.15 else "done"
+    if states["cameras"] == "done" and states.get("coarse") == "done":
+        assert set(states) == {unit.name for unit in scene.units}
+    else:
+        assert "scene" not in states
+        assert not any(name.startswith("tile") for name in states)
+
+
+def test_only_what_depends_on_an_option_has_another_key() -> None:
+    names = [unit.name for unit in plan().units]
+
+    def changed(other: ScenePlan) -> set[str]:
+        return {name for name in names if plan().key(name, {}) != other.key(name, {})}
+
+    assert changed(plan()) == set()
+    assert changed(plan(steps=500)) == set(names) - {"cameras"}
+    assert changed(plan(tiles=5)) == set(names) - {"cameras"}
+    assert changed(plan(sfm_effort="high")) == set(names)
+    assert changed(plan(digest="e")) == set(names)
+    keys = [plan().key(name, {}) for name in names]
+    assert len(set(keys)) == len(keys)
+
+
+def test_a_scene_without_a_failed_tile_is_another_output() -> None:
+    whole = plan().key("scene", {"tile-1": "done", "tile-2": "done"})
+    assert plan().key("scene", {"tile-1": "done", "tile-2": "failed"}) != whole
+    assert plan().key("scene", {"tile-1": "done"}) == whole
+
+
+def test_options_that_cameras_follow_from_exist_and_a_plan_survives_json() -> None:
+    assert set(CAMERA_OPTIONS) <= set(TrainOptions.model_fields)
+    given = plan(7, steps=300, holdout=5)
+    assert ScenePlan.from_dict(given.as_dict()) == given
+    with pytest.raises(ValueError, match="format 9"):
+        ScenePlan.from_dict({**given.as_dict(), "format": 9})
+    with pytest.raises(KeyError):
+        given.unit("tile-8")

@@ -1,0 +1,305 @@
+"""A plan on disk: a folder that any number of processes share, with the outputs of its units, each written whole."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import socket
+import threading
+import uuid
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from splatmill.files import atomic_write
+from splatmill_worker.errors import Refusal
+from splatmill_worker.tiles.units import ScenePlan, State
+
+PLAN, CAPTURE, UNITS, SCENE = "plan.json", "capture", "units", "scene"
+"""The plan, the files of the capture, the outputs of the units, and a link to the output of the last one."""
+
+CLAIM_SECONDS = 60.0
+"""Age of a claim from which its process counts as gone."""
+
+BEAT_SECONDS = 5.0
+"""Time between two renewals of a claim by a process that runs."""
+
+DONE = "done.json"
+"""The file of an output that is written last; its folder is renamed after that."""
+
+
+class Claimed(Exception):
+    """Another process runs the unit."""
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a unit ended.
+
+    state: "done" or "failed".
+    path: folder of its output; None where it failed.
+    failure: the sentence that it failed with; empty where it did not.
+    advice: what to do about that.
+    """
+
+    state: State
+    path: Path | None = None
+    failure: str = ""
+    advice: str = ""
+
+
+class PlanFolder:
+    """The folder of a plan.
+
+    root: the folder.
+    plan: the plan.
+    beat_seconds: time between two renewals of a claim.
+    """
+
+    def __init__(self, root: Path, plan: ScenePlan, *, beat_seconds: float = BEAT_SECONDS) -> None:
+        self.root, self.plan, self.beat_seconds = root, plan, beat_seconds
+
+    @staticmethod
+    def open(root: Path) -> PlanFolder:
+        """The folder that `create` made. Raises Refusal where there is no plan, or none that can be read."""
+        path = root / PLAN
+        if not path.is_file():
+            raise Refusal(
+                "option_out_of_range",
+                f"{root} has no {PLAN}.",
+                advice="Make the plan first: splatmill plan PHOTOS -o FOLDER --tiles 4",
+            )
+        try:
+            return PlanFolder(root, ScenePlan.from_dict(json.loads(path.read_text("utf-8"))))
+        except (ValueError, KeyError, TypeError, OSError) as error:
+            raise Refusal(
+                "option_out_of_range",
+                f"{path} is not a plan that this version can read: {error}",
+                advice="Make it again with splatmill plan; what its units have made is used where it still holds.",
+            ) from error
+
+    def save(self) -> None:
+        """Write the plan."""
+        self.root.mkdir(parents=True, exist_ok=True)
+        atomic_write(self.root / PLAN, json.dumps(self.plan.as_dict(), indent=1))
+
+    @property
+    def capture(self) -> Path:
+        """The folder of the photos."""
+        return self.root / CAPTURE
+
+    def states(self) -> dict[str, State]:
+        """The units that have ended, by name."""
+        return {name: ended.state for name, ended in self.ended().items()}
+
+    def ended(self) -> dict[str, Ended]:
+        """How units have ended, by name, in the order of the plan."""
+        found: dict[str, Ended] = {}
+        states: dict[str, State] = {}
+        for unit in self.plan.units:
+            if self.plan.missing(unit.name, states):
+                continue
+            path = self._path(unit.name, states)
+            if (path / DONE).is_file():
+                found[unit.name] = Ended("done", path)
+            elif (failure := _read(path.with_suffix(".failed.json"))) is not None:
+                found[unit.name] = Ended("failed", None, str(failure["failure"]), str(failure["advice"]))
+            else:
+                continue
+            states[unit.name] = found[unit.name].state
+        return found
+
+    def running(self, name: str) -> str | None:
+        """Which process runs the unit, as text; None where none does."""
+        claim = self._path(name, self.states()).with_suffix(".claim")
+        document = _read(claim)
+        try:
+            if document is None or self._age(claim) > CLAIM_SECONDS or _has_ended(claim):
+                return None
+        except FileNotFoundError:
+            return None
+        return f"{document.get('host')}, process {document.get('pid')}"
+
+    def forget_failure(self, name: str) -> None:
+        """Let a unit that failed be run again."""
+        states = self.states()
+        states.pop(name, None)
+        self._path(name, states).with_suffix(".failed.json").unlink(missing_ok=True)
+
+    @contextmanager
+    def claimed(self, name: str) -> Iterator[Run]:
+        """Hold the unit `name`, so that no other process runs it, while the context lasts.
+
+        Raises Claimed where another process holds it, and KeyError where the plan has no such unit.
+        """
+        path = self._path(name, self.states())
+        path.parent.mkdir(parents=True, exist_ok=True)
+        claim = path.with_suffix(".claim")
+        token = uuid.uuid4().hex
+        self._take(claim, token)
+        work = path.with_name(f"{path.name}.{token}.work")
+        work.mkdir()
+        ended = threading.Event()
+        held = threading.Event()
+        held.set()
+        beat = threading.Thread(target=self._renew, args=(claim, token, ended, held), daemon=True)
+        beat.start()
+        try:
+            yield Run(name, path, work, held.is_set)
+        finally:
+            ended.set()
+            beat.join()
+            shutil.rmtree(work, ignore_errors=True)
+            if _token(claim) == token:
+                claim.unlink(missing_ok=True)
+
+    def _path(self, name: str, states: dict[str, State]) -> Path:
+        return self.root / UNITS / f"{name}-{self.plan.key(name, states)}"
+
+    def _take(self, claim: Path, token: str) -> None:
+        """Write the claim. Raises Claimed where there is one that is still renewed."""
+        text = json.dumps({"token": token, **_process()})
+        own = claim.with_name(f"{claim.name}.{token}")
+        own.write_text(text, "utf-8")
+        try:
+            try:
+                os.link(own, claim)  # fails where the claim exists, on network file systems too
+            except FileExistsError:
+                self._remove_stale(claim, token)
+                try:
+                    os.link(own, claim)
+                except FileExistsError:
+                    raise Claimed from None
+        finally:
+            own.unlink(missing_ok=True)
+
+    def _remove_stale(self, claim: Path, token: str) -> None:
+        """Remove a claim that nobody renews, with what its process left. Raises Claimed for one that is renewed."""
+        try:
+            if self._age(claim) <= CLAIM_SECONDS and not _has_ended(claim):
+                raise Claimed
+            aside = claim.with_name(f"{claim.name}.{token}.stale")
+            claim.rename(aside)  # one of several processes succeeds
+        except FileNotFoundError:
+            return
+        if (gone := _token(aside)) is not None:
+            shutil.rmtree(claim.with_name(f"{claim.stem}.{gone}.work"), ignore_errors=True)
+        aside.unlink(missing_ok=True)
+
+    def _age(self, claim: Path) -> float:
+        """Seconds since a claim was renewed, by the clock of the file system: those of machines differ."""
+        now = claim.with_name(f"clock.{uuid.uuid4().hex}")
+        now.touch()
+        try:
+            return now.stat().st_mtime - claim.stat().st_mtime
+        finally:
+            now.unlink(missing_ok=True)
+
+    def _renew(self, claim: Path, token: str, ended: threading.Event, held: threading.Event) -> None:
+        """Renew the claim until `ended`; clear `held` when it is another's, as after this process was frozen."""
+        while not ended.wait(self.beat_seconds):
+            if _token(claim) != token:
+                held.clear()
+                return
+            try:
+                os.utime(claim)
+            except FileNotFoundError:
+                held.clear()
+                return
+            except OSError:
+                continue  # the file system does not answer; the claim holds for CLAIM_SECONDS
+
+
+@dataclass(frozen=True)
+class Run:
+    """A unit that this process holds.
+
+    name: of the unit.
+    path: folder that its output will have.
+    work: folder for files of this run, removed when it ends.
+    held: whether the unit is still this process's; false after it was frozen for long.
+    """
+
+    name: str
+    path: Path
+    work: Path
+    held: Callable[[], bool]
+
+    @property
+    def out(self) -> Path:
+        """The folder to write the output to."""
+        return self.work / "out"
+
+    def publish(self, facts: dict[str, Any]) -> None:
+        """Make `out` the output of the unit, with `facts` in its last file. That of another process stays."""
+        self.out.mkdir(exist_ok=True)
+        atomic_write(self.out / DONE, json.dumps(facts, indent=1))
+        try:
+            self.out.rename(self.path)
+        except OSError:
+            if not (self.path / DONE).is_file():
+                raise
+
+    def fail(self, failure: str, advice: str) -> None:
+        """Record that the unit cannot be done, unless another process has it by now."""
+        if self.held():
+            document = json.dumps({"failure": failure, "advice": advice})
+            atomic_write(self.path.with_suffix(".failed.json"), document)
+
+
+def digest_of(capture: Path) -> str:
+    """A digest of the names and contents of all files in a folder."""
+    whole = hashlib.sha256()
+    for path in sorted(path for path in capture.rglob("*") if path.is_file()):
+        with path.open("rb") as file:
+            content = hashlib.file_digest(file, "sha256").hexdigest()
+        whole.update(f"{path.relative_to(capture).as_posix()}\0{content}\n".encode())
+    return whole.hexdigest()
+
+
+def facts_of(path: Path) -> dict[str, Any]:
+    """The facts that a unit has published."""
+    facts: dict[str, Any] = json.loads((path / DONE).read_text("utf-8"))
+    return facts
+
+
+def _read(path: Path) -> dict[str, Any] | None:
+    try:
+        document = json.loads(path.read_text("utf-8"))
+    except (OSError, ValueError):
+        return None
+    return document if isinstance(document, dict) else None
+
+
+def _process() -> dict[str, Any]:
+    """This process, so that others on the same machine see whether it still runs."""
+    namespace = Path("/proc/self/ns/pid")
+    return {
+        "host": socket.gethostname(),
+        "namespace": os.readlink(namespace) if namespace.is_symlink() else "",
+        "pid": os.getpid(),
+        "started": psutil.Process().create_time(),
+    }
+
+
+def _has_ended(claim: Path) -> bool:
+    """Whether the process of a claim was one of this machine and runs no more; False where that cannot be seen."""
+    theirs, ours = _read(claim) or {}, _process()
+    if any(theirs.get(name) != ours[name] for name in ("host", "namespace")):
+        return False
+    try:
+        return bool(psutil.Process(int(theirs["pid"])).create_time() != theirs["started"])
+    except psutil.NoSuchProcess:
+        return True
+    except (psutil.Error, KeyError, TypeError, ValueError):
+        return False
+
+
+def _token(claim: Path) -> str | None:
+    return str((_read(claim) or {}).get("token"))

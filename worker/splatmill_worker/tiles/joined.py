@@ -1,0 +1,219 @@
+"""The scene that the tiles of a plan make together: its Gaussians, what they show, and its files."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from splatmill_worker.pipeline.cameras import Cameras, recover_cameras
+from splatmill_worker.pipeline.events import TrainingEvents
+from splatmill_worker.pipeline.files import write_files
+from splatmill_worker.pipeline.job import Job
+from splatmill_worker.pipeline.photos import Photos
+from splatmill_worker.pipeline.planning import plan_training, planned_photos
+from splatmill_worker.pipeline.stage_times import Stages
+from splatmill_worker.pipeline.training import Recording
+from splatmill_worker.splat.engine.open import open_engine
+from splatmill_worker.splat.engine.protocol import Engine
+from splatmill_worker.splat.evaluate import Score, evaluate
+from splatmill_worker.splat.gaussians import Gaussians, concatenate
+from splatmill_worker.splat.lpips import Distances
+from splatmill_worker.splat.machine import resident_memory
+from splatmill_worker.splat.plan.evaluated import finally_evaluated
+from splatmill_worker.splat.plan.plan import Plan
+from splatmill_worker.splat.plan.plan_file import write_plan
+from splatmill_worker.splat.train.curve import CurvePoint
+from splatmill_worker.splat.train.loop import Trained
+from splatmill_worker.splat.train.renderer import evaluation_background, renderer
+from splatmill_worker.splat.views import TrainingView
+from splatmill_worker.tiles.coarse_model import Coarse, read_gaussians
+from splatmill_worker.tiles.seams import Seams
+
+
+@dataclass(frozen=True)
+class TrainedTile:
+    """How the training of a tile ended.
+
+    path: folder of its output; None where it failed.
+    facts: that it published.
+    failure: the sentence that it failed with.
+    """
+
+    path: Path | None
+    facts: dict[str, Any]
+    failure: str = ""
+
+
+@dataclass(frozen=True)
+class Joining:
+    """What the scene is made of.
+
+    job: the unit as a job, with the options of the coarse training.
+    stages: its clocks.
+    coarse: the coarse model, with a cell for each tile.
+    tiles: the trained tiles, in the order of the cells.
+    facts: that the coarse training published.
+    """
+
+    job: Job
+    stages: Stages
+    coarse: Coarse
+    tiles: tuple[TrainedTile, ...]
+    facts: dict[str, Any]
+
+    @property
+    def steps(self) -> int:
+        """Training steps of all units."""
+        return int(self.facts["steps"]) + sum(int(tile.facts.get("steps", 0)) for tile in self.tiles)
+
+    @property
+    def seconds(self) -> float:
+        """Training seconds of all units, as long as one process takes for them."""
+        return float(self.facts["train_seconds"]) + sum(
+            float(tile.facts.get("train_seconds", 0.0)) for tile in self.tiles
+        )
+
+    @property
+    def failures(self) -> list[str]:
+        """A sentence for each tile that failed."""
+        return [
+            f"Tile {number} of {len(self.tiles)} failed, so that its place shows the coarse model: {tile.failure}"
+            for number, tile in enumerate(self.tiles, 1)
+            if tile.path is None
+        ]
+
+    def gaussians(self) -> Gaussians:
+        """Those of every cell: of its tile, or of the coarse model where the tile failed."""
+        means = self.coarse.gaussians.means.double().numpy()
+        return concatenate(
+            *(
+                self.coarse.gaussians.select(torch.from_numpy(cell.holds(means)))
+                if tile.path is None
+                else read_gaussians(tile.path)
+                for cell, tile in zip(self.coarse.cells, self.tiles, strict=True)
+            )
+        )
+
+
+def write_scene(joining: Joining) -> dict[str, Any]:
+    """Write the files that a training of the whole scene writes; returns figures by name."""
+    job, stages, coarse = joining.job, joining.stages, joining.coarse
+    cameras = known_cameras(job, stages)
+    write_plan(job.workdir / "plan.json", job.options, coarse.plan)
+    planned = plan_training(job, cameras, lambda plan: plan, stages)
+    photos = _corrected(planned_photos(cameras, planned, stages), coarse)
+    planned = replace(planned, plan=_stated(joining))
+    gaussians = joining.gaussians()
+    engine = open_engine(gaussians, coarse.plan.kernels)
+    trained = _trained(joining, engine, photos)
+    record = Recording(TrainingEvents(job.emit, job.workdir, coarse.plan, photos.shown), None, None)
+    for sentence in joining.failures:
+        record.events.warn(sentence)
+    write_files(job, cameras, planned, photos, engine, trained, record, stages)
+    held_out = trained.held_out
+    return {
+        "gaussians": gaussians.count,
+        "steps": trained.steps,
+        "train_seconds": round(trained.seconds, 2),
+        "psnr": None if held_out is None else held_out.psnr,
+        "ssim": None if held_out is None else held_out.ssim,
+        "failed": [number for number, tile in enumerate(joining.tiles, 1) if tile.path is None],
+        "seams": _seams(joining, gaussians, photos),
+    }
+
+
+def known_cameras(job: Job, stages: Stages) -> Cameras:
+    """The cameras that the unit `cameras` has found. What there is to be said of them was said there."""
+    return recover_cameras(replace(job, emit=lambda event: None), stages)
+
+
+def _corrected(photos: Photos, coarse: Coarse) -> Photos:
+    """The photos, with those of the training as the coarse training left their cameras."""
+    views = []
+    for view in photos.training:
+        camera = coarse.corrected(view.name, view.full.camera)
+        viewmat = torch.as_tensor(camera.viewmat, dtype=torch.float32)
+        views.append(replace(view, levels={1: view.full._replace(camera=camera, viewmat=viewmat)}))
+    return replace(photos, training=tuple(views))
+
+
+def _stated(joining: Joining) -> Plan:
+    """The plan as the report has it: that of the coarse training, with the number of Gaussians of the whole."""
+    plan, count = joining.coarse.plan, len(joining.tiles)
+    because = (
+        f"The scene is trained in {count} tiles, after a coarse model of {joining.coarse.gaussians.count} Gaussians. "
+        f"All tiles together may have about {joining.coarse.most}."
+    )
+    return replace(
+        plan, max_gaussians=joining.coarse.most, reasons={**plan.reasons, "max_gaussians": because}
+    )
+
+
+def _trained(joining: Joining, engine: Engine, photos: Photos) -> Trained:
+    """The scene as the result of one training, whose curve is that of the coarse training and a last point."""
+    plan = joining.coarse.plan
+    with joining.stages.measured("evaluate"):
+        held_out, on_training = _scores(joining.job, engine, plan, photos)
+    curve = tuple(CurvePoint(**point) for point in joining.facts["curve"])
+    last = CurvePoint(
+        seconds=joining.seconds,
+        step=joining.steps,
+        loss=curve[-1].loss if curve else math.nan,
+        psnr=None if held_out is None else held_out.psnr,
+        ssim=None if held_out is None else held_out.ssim,
+        gaussians=engine.count,
+        memory=resident_memory(),
+        train_psnr=on_training.psnr,
+        train_ssim=on_training.ssim,
+        views=None if held_out is None else len(held_out.views),
+    )
+    return Trained(
+        gaussians=Gaussians(**engine.parameters()).padded(plan.schedule.degree),
+        curve=(*curve, last),
+        held_out=held_out,
+        on_training=on_training,
+        steps=joining.steps,
+        seconds=joining.seconds,
+        evaluate_seconds=joining.stages.seconds["evaluate"],
+        stopped=f"{len(joining.tiles)} tiles were trained",
+        failure=None,
+        recoveries=0,
+        views=photos.training,
+        cameras_moved=joining.facts["cameras_moved"],
+    )
+
+
+def _scores(job: Job, engine: Engine, plan: Plan, photos: Photos) -> tuple[Score | None, Score]:
+    render, background = renderer(engine, plan), evaluation_background(plan, photos.training)
+    distances = Distances.read() if plan.lpips and photos.held_out else None
+    events = TrainingEvents(job.emit, job.workdir, plan, photos.shown)
+    done = iter(range(1, len(photos.held_out) + 1))
+    held_out = (
+        evaluate(
+            render,
+            photos.held_out,
+            background,
+            distances,
+            lambda: events.evaluating(next(done), len(photos.held_out)),
+        )
+        if photos.held_out
+        else None
+    )
+    return held_out, evaluate(render, finally_evaluated(photos.training), background)
+
+
+def _seams(joining: Joining, gaussians: Gaussians, photos: Photos) -> dict[str, Any] | None:
+    """How the held-out photos are shown where two tiles meet; None without such photos or with one tile."""
+    views: Sequence[TrainingView] = photos.held_out
+    if not views or len(joining.coarse.cells) < 2:
+        return None
+    means = joining.coarse.gaussians.means.double().numpy()
+    members: list[Tensor] = [torch.from_numpy(cell.holds(means)) for cell in joining.coarse.cells]
+    seams = Seams(joining.coarse.gaussians, members, joining.coarse.plan)
+    return asdict(seams.measured(gaussians, views))

@@ -1,0 +1,118 @@
+"""How well a scene in tiles shows photos where two tiles meet, beside the rest of each photo."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from splatmill_worker.splat.engine.cpu import CpuEngine
+from splatmill_worker.splat.evaluate import psnr
+from splatmill_worker.splat.gaussians import SH_C0, Gaussians
+from splatmill_worker.splat.plan.plan import Plan
+from splatmill_worker.splat.train.renderer import evaluation_background, renderer
+from splatmill_worker.splat.views import TrainingView
+
+MOST_LIGHT = 0.9
+"""Share of a pixel's light that one tile has at most where the pixel counts as a seam."""
+
+
+@dataclass(frozen=True)
+class SeamScore:
+    """PSNR in dB of all pixels of the held-out photos together, in two parts; None for a part without pixels.
+
+    share: of the pixels that are seams.
+    seams, others: PSNR of the scene on the seams and elsewhere.
+    coarse_seams, coarse_others: the same of the coarse model, which has no seams. What seams cost is the difference of
+        what the tiles gain over it in the two parts.
+    """
+
+    share: float
+    seams: float | None
+    others: float | None
+    coarse_seams: float | None
+    coarse_others: float | None
+
+    @property
+    def cost(self) -> float | None:
+        """dB that the tiles gain less on seams than elsewhere; negative where they gain more."""
+        if (
+            self.seams is None
+            or self.coarse_seams is None
+            or self.others is None
+            or self.coarse_others is None
+        ):
+            return None
+        return (self.others - self.coarse_others) - (self.seams - self.coarse_seams)
+
+
+class Seams:
+    """Where photos show the seams of tiles, by the coarse model.
+
+    coarse: the coarse model.
+    members: of each tile, bool [N] over the Gaussians of the coarse model.
+    plan: how they are rendered.
+    """
+
+    def __init__(self, coarse: Gaussians, members: Sequence[Tensor], plan: Plan) -> None:
+        self._coarse, self._plan = coarse, plan
+        self._engines = [
+            CpuEngine(_with_colors(coarse, members[first : first + 3])) for first in range(0, len(members), 3)
+        ]
+
+    def measured(self, scene: Gaussians, views: Sequence[TrainingView]) -> SeamScore:
+        """The errors of `scene` and of the coarse model on the two parts of `views`."""
+        background = evaluation_background(self._plan, views)
+        renders = [renderer(CpuEngine(each), self._plan) for each in (scene, self._coarse)]
+        sums = torch.zeros(2, 2, dtype=torch.float64)  # by model, then seams and others
+        counts = torch.zeros(2, dtype=torch.float64)
+        for view in views:
+            target = view.full
+            used = torch.ones(target.rgb.shape[:2], dtype=torch.bool) if target.mask is None else target.mask
+            seams = self._seams(view)
+            parts = [used & seams, used & ~seams]
+            counts += torch.tensor([float(part.sum()) for part in parts])
+            photo = target.over(background).float() / 255.0
+            for row, render in enumerate(renders):
+                error = (render(target, background).clamp(0.0, 1.0) - photo).square().mean(dim=2).double()
+                sums[row] += torch.stack([error[part].sum() for part in parts])
+        values = [
+            None if counts[part] == 0 else psnr(float(sums[row, part] / counts[part]))
+            for row in range(2)
+            for part in range(2)
+        ]
+        return SeamScore(float(counts[0] / counts.sum().clamp_min(1.0)), *values)
+
+    def _seams(self, view: TrainingView) -> Tensor:
+        """bool [H, W]: pixels that the scene fills, and most of whose light is of no one tile."""
+        camera = view.full.camera
+        largest = torch.zeros(camera.height, camera.width)
+        light = torch.zeros_like(largest)
+        for engine in self._engines:
+            shares, _, _ = engine.forward(
+                view.full.viewmat,
+                view.full.K,
+                camera.width,
+                camera.height,
+                degree=0,
+                antialias=self._plan.antialias,
+            )
+            largest = torch.maximum(largest, shares.amax(dim=2))
+            light += shares.sum(dim=2)
+        return (largest < MOST_LIGHT * light) & (light > 0.5)
+
+
+def _with_colors(coarse: Gaussians, members: Sequence[Tensor]) -> Gaussians:
+    """The Gaussians with a colour channel of 1 for the members of each of up to three tiles, and 0 for the others."""
+    colors = torch.zeros(coarse.count, 3)
+    for channel, of_tile in enumerate(members):
+        colors[:, channel] = of_tile.float()
+    return Gaussians(
+        coarse.means,
+        coarse.log_scales,
+        coarse.quats,
+        coarse.logit_opacities,
+        ((colors - 0.5) / SH_C0)[:, None],
+    )

@@ -1,0 +1,197 @@
+"""What each unit of a plan does: cameras, the coarse model, a tile, and the scene that all of them make."""
+
+from __future__ import annotations
+
+import math
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from splatmill.schema import TrainOptions
+from splatmill_worker.errors import Refusal
+from splatmill_worker.images.load import training_size
+from splatmill_worker.pipeline.cameras import Cameras, recover_cameras
+from splatmill_worker.pipeline.events import Emit
+from splatmill_worker.pipeline.first_gaussians import seeded
+from splatmill_worker.pipeline.job import Job, choose_kernels
+from splatmill_worker.pipeline.planning import plan_training, planned_photos
+from splatmill_worker.pipeline.stage_times import Stages
+from splatmill_worker.pipeline.training import train_scene
+from splatmill_worker.splat.engine.open import open_engine
+from splatmill_worker.splat.plan.capacity import resolved
+from splatmill_worker.splat.plan.photos import loading_size
+from splatmill_worker.splat.plan.plan import Plan
+from splatmill_worker.tiles import coarse_model, joined
+from splatmill_worker.tiles.cells import divide
+from splatmill_worker.tiles.folder import PlanFolder, Run, facts_of
+from splatmill_worker.tiles.tile import Tile, train_tile
+from splatmill_worker.tiles.units import ScenePlan
+
+STEPS_SHARE = 0.5
+"""Share of the steps of a whole run that the coarse model takes, and that each tile takes after it."""
+
+SFM = "sfm"
+"""Folder of the recovered cameras in a work folder, and in the output of the unit `cameras`."""
+
+
+@dataclass(frozen=True)
+class Context:
+    """What units are run with.
+
+    folder: the plan.
+    run: the unit that this process holds.
+    emit: called with each event.
+    cancelled: polled; the unit ends with Cancelled when it returns true.
+    """
+
+    folder: PlanFolder
+    run: Run
+    emit: Emit
+    cancelled: Callable[[], bool]
+
+    def job(self, options: TrainOptions) -> Job:
+        """A job in the work folder of the unit, which has the recovered cameras there are."""
+        work = self.run.work
+        work.joinpath("out").mkdir(exist_ok=True)
+        cameras = self.folder.ended().get("cameras")
+        if cameras is not None and cameras.path is not None and (cameras.path / SFM).is_dir():
+            shutil.copytree(cameras.path / SFM, work / SFM, dirs_exist_ok=True)
+        return Job(
+            self.folder.capture, work, options, choose_kernels(options), self.emit, self.cancelled, looks=None
+        )
+
+    def output(self, unit: str) -> Path:
+        """The folder of the output of a unit that is done."""
+        path = self.folder.ended()[unit].path
+        assert path is not None
+        return path
+
+
+def run_unit(context: Context) -> None:
+    """Do the unit that `context` holds, and publish its output. Raises WorkerError for what would fail again."""
+    name, started = context.run.name, time.perf_counter()
+    stages = Stages(context.run.work / "stages.json")
+    if name == "cameras":
+        facts = _cameras(context, stages)
+    elif name == "coarse":
+        facts = _coarse(context, stages)
+    elif name == "scene":
+        facts = joined.write_scene(_joining(context, stages))
+    else:
+        facts = _tile(context, stages)
+    context.run.publish({"seconds": round(time.perf_counter() - started, 1), **facts})
+
+
+def _cameras(context: Context, stages: Stages) -> dict[str, Any]:
+    job = context.job(context.folder.plan.options)
+    cameras = recover_cameras(job, stages)
+    found = sorted((job.workdir / SFM).glob("*/model-*"))
+    shutil.rmtree(context.run.out)  # what recovering leaves there is not for others
+    for model in found:
+        shutil.copytree(model, context.run.out / model.relative_to(job.workdir))
+    return {"photos": len(cameras.training), "held_out": len(cameras.held_out)}
+
+
+def _coarse(context: Context, stages: Stages) -> dict[str, Any]:
+    plan = context.folder.plan
+    job = context.job(plan.options)
+    cameras = joined.known_cameras(job, stages)
+    most = _most(cameras, job)
+    job = replace(job, options=_coarse_options(plan, most))
+    planned = plan_training(job, cameras, _shorter, stages)
+    photos = planned_photos(cameras, planned, stages)
+    decided = planned.plan
+    engine = open_engine(
+        seeded(planned.first, cameras, photos, decided), decided.kernels, clustered=decided.cluster_culling
+    )
+    trained, _ = train_scene(job, cameras, photos, decided, engine)
+    if trained.failure is not None:
+        raise trained.failure
+    shutil.rmtree(context.run.out)
+    context.run.out.mkdir()
+    weights = trained.gaussians.logit_opacities.double().sigmoid().numpy()
+    cells = divide(trained.gaussians.means.double().numpy(), weights, plan.tiles)
+    light = planned.facts.light if decided.exposure else None
+    coarse_model.Coarse.of(trained, decided, cells, most, light).write(context.run.out)
+    held_out = trained.held_out
+    return {
+        "gaussians": trained.gaussians.count,
+        "steps": trained.steps,
+        "train_seconds": round(trained.seconds, 2),
+        "psnr": None if held_out is None else held_out.psnr,
+        "tiles": len(cells),
+        "curve": [asdict(point) for point in trained.curve],
+        "cameras_moved": trained.cameras_moved,
+    }
+
+
+def _tile(context: Context, stages: Stages) -> dict[str, Any]:
+    number = int(context.run.name.removeprefix("tile-"))
+    job = context.job(context.folder.plan.options)
+    coarse = coarse_model.read(context.output("coarse"))
+    context.run.out.mkdir(exist_ok=True)
+    if number > len(coarse.cells):
+        return {"gaussians": 0, "steps": 0, "photos": 0}  # the coarse model could not be divided further
+    cameras = joined.known_cameras(job, stages)
+    tile = Tile(job, cameras, coarse, number - 1)
+    result = train_tile(tile, stages)
+    shutil.rmtree(context.run.out)
+    context.run.out.mkdir()
+    coarse_model.write_gaussians(context.run.out, result.gaussians)
+    return result.facts
+
+
+def _joining(context: Context, stages: Stages) -> joined.Joining:
+    ended = context.folder.ended()
+    coarse = coarse_model.read(context.output("coarse"))
+    job = context.job(_coarse_options(context.folder.plan, coarse.most))
+    tiles = []
+    for number in range(len(coarse.cells)):
+        tile = ended[f"tile-{number + 1}"]
+        facts = {} if tile.path is None else facts_of(tile.path)
+        tiles.append(joined.TrainedTile(tile.path, facts, tile.failure))
+    return joined.Joining(job, stages, coarse, tuple(tiles), facts_of(context.output("coarse")))
+
+
+def _coarse_options(plan: ScenePlan, most: int) -> TrainOptions:
+    """The options of the coarse training, of a scene of at most `most` Gaussians in all.
+
+    The coarse model has at most `most` over the root of the number of tiles, and a tile has beside it at most `most`
+    over their number: the more tiles, the less of both.
+    """
+    return plan.options.model_copy(update={"max_gaussians": max(1, math.ceil(most / math.sqrt(plan.tiles)))})
+
+
+def _most(cameras: Cameras, job: Job) -> int:
+    """The largest number of Gaussians of the whole scene: that of the option, or what its photos resolve."""
+    if job.options.max_gaussians is not None:
+        return job.options.max_gaussians
+    size = loading_size(job.options, job.kernels)
+    pixels = [math.prod(training_size(v.camera.width, v.camera.height, size)) for v in cameras.training]
+    if not pixels:
+        raise Refusal("too_few_photos", "No photo is left to train on.")
+    return resolved(sum(pixels) / len(pixels), len(pixels))
+
+
+def _shorter(plan: Plan) -> Plan:
+    """The plan of a whole run with STEPS_SHARE of its steps."""
+    schedule = plan.schedule
+    budget = schedule.budget
+    assert budget.steps is not None
+
+    def share(steps: int) -> int:
+        return max(1, round(STEPS_SHARE * steps))
+
+    return replace(
+        plan,
+        schedule=replace(
+            schedule,
+            budget=replace(budget, steps=share(budget.steps)),
+            longest=None if schedule.longest is None else share(schedule.longest),
+            expected_steps=share(schedule.expected_steps),
+            resolution=tuple((share(first) if first else 0, factor) for first, factor in schedule.resolution),
+        ),
+    )

@@ -1,0 +1,192 @@
+"""Trains one tile: the Gaussians in and next to its cell, before the coarse model of everything else."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from splatmill.schema import LogEvent, ProgressEvent
+from splatmill_worker import memory
+from splatmill_worker.images import look_ups
+from splatmill_worker.images.load import load_view, training_size
+from splatmill_worker.images.panoramas import decoded_panoramas
+from splatmill_worker.images.pixel_files import PixelFiles
+from splatmill_worker.pipeline.cameras import Cameras
+from splatmill_worker.pipeline.job import Job
+from splatmill_worker.pipeline.photos import Room
+from splatmill_worker.pipeline.stage_times import Stages
+from splatmill_worker.pipeline.training import EXTENT
+from splatmill_worker.scene import View
+from splatmill_worker.splat.engine.open import open_engine
+from splatmill_worker.splat.gaussians import Gaussians
+from splatmill_worker.splat.plan.photos import BYTES_PER_PIXEL, fit_in_memory
+from splatmill_worker.splat.plan.plan import Plan
+from splatmill_worker.splat.train.loop import Hooks, train
+from splatmill_worker.splat.train.observers import TrainingProgress
+from splatmill_worker.splat.views import TrainingView
+from splatmill_worker.tiles.coarse_model import Coarse
+from splatmill_worker.tiles.visibility import Part, parts
+
+MARGIN = 0.05
+"""Width of what is trained around a cell and then left to the tiles beside it, over the longest side of the box that
+holds four fifths of the coarse model."""
+
+LOADED = 8
+"""Photos that are loaded whole at a time; of each, only the part that shows the tile is kept."""
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A tile to train.
+
+    job: the unit as a job.
+    cameras: of the photos.
+    coarse: the coarse model.
+    number: of the cell, from 0.
+    """
+
+    job: Job
+    cameras: Cameras
+    coarse: Coarse
+    number: int
+
+
+@dataclass(frozen=True)
+class TileResult:
+    """A trained tile.
+
+    gaussians: those within its cell, in the training world.
+    facts: figures by name.
+    """
+
+    gaussians: Gaussians
+    facts: dict[str, Any]
+
+
+def train_tile(tile: Tile, stages: Stages) -> TileResult:
+    """Train the Gaussians of a tile, on the parts of the photos that show them. Where no photo does, they stay as they
+    are. Raises TrainingFailed, and Cancelled.
+    """
+    coarse = tile.coarse
+    cell, whole = coarse.cells[tile.number], coarse.gaussians
+    means = whole.means.double().numpy()
+    core = torch.from_numpy(cell.holds(means))
+    free = torch.from_numpy(cell.holds(means, _margin(whole)))
+    with stages.measured("load"):
+        views = list(_views(tile, core))
+        memory.return_freed()
+    within = whole.select(core)
+    if not views or not within.count:
+        return TileResult(within, {"gaussians": within.count, "steps": 0, "photos": len(views)})
+    plan = _plan(coarse, int(free.sum()), len(views))
+    engine = open_engine(
+        whole.select(free), plan.kernels, clustered=plan.cluster_culling, context=whole.select(~free)
+    )
+
+    def progress(progress: TrainingProgress) -> None:
+        tile.job.emit(
+            ProgressEvent(stage="training", done=progress.step, total=progress.steps, eta=progress.eta)
+        )
+
+    trained = train(
+        engine,
+        views,
+        [],
+        plan,
+        extent=EXTENT,
+        hooks=Hooks(
+            progress=progress,
+            warn=lambda sentence: tile.job.emit(LogEvent(level="warning", message=sentence)),
+            cancelled=tile.job.cancelled,
+        ),
+    )
+    if trained.failure is not None:
+        raise trained.failure
+    stages.add("train", trained.seconds)
+    gaussians = trained.gaussians.padded(3)
+    kept = gaussians.select(torch.from_numpy(cell.holds(gaussians.means.double().numpy())))
+    return TileResult(
+        kept,
+        {
+            "gaussians": kept.count,
+            "steps": trained.steps,
+            "photos": len(views),
+            "train_seconds": round(trained.seconds, 2),
+            "train_psnr": round(trained.on_training.psnr, 3),
+        },
+    )
+
+
+def _margin(gaussians: Gaussians) -> float:
+    low, high = torch.quantile(_some(gaussians.means.double()), torch.tensor([0.1, 0.9]).double(), dim=0)
+    return MARGIN * float((high - low).max())
+
+
+def _some(rows: Tensor, limit: int = 100_000) -> Tensor:
+    """An even choice of at most `limit` rows: torch's quantiles take no more than 16 million numbers."""
+    return rows[:: max(1, math.ceil(len(rows) / limit))]
+
+
+def _plan(coarse: Coarse, free: int, photos: int) -> Plan:
+    """The plan of a tile of `free` Gaussians that so many photos show: that of the coarse model, from a model on."""
+    plan, schedule = coarse.plan, coarse.plan.schedule
+    most = max(free, math.ceil(coarse.most * free / max(1, coarse.gaussians.count)))
+    aside = None
+    if plan.validation is not None:
+        aside = max(1, round(plan.validation * photos / len(coarse.viewmats))) if photos > 1 else None
+    return replace(
+        plan,
+        kernels="cpu" if plan.kernels == "gpu" else plan.kernels,
+        max_gaussians=most,
+        densify=plan.densify or most > free,
+        initial="model",
+        far_shell=False,
+        gaps=False,
+        pose_refinement=False,
+        validation=aside,
+        stops_when_flat=plan.stops_when_flat and aside is not None,
+        target_psnr=plan.target_psnr if aside is not None else None,
+        lpips=False,
+        schedule=replace(schedule, resolution=((0, 1),)),
+    )
+
+
+def _views(tile: Tile, members: Tensor) -> Iterator[TrainingView]:
+    """The parts of the training photos that show the members, bool [N], in files where memory is too small for them."""
+    coarse, cameras = tile.coarse, tile.cameras
+    size = coarse.plan.image_size
+    reduced = []
+    for view in cameras.training:
+        camera = view.camera.scaled_to(*training_size(view.camera.width, view.camera.height, size))
+        reduced.append(coarse.corrected(view.name, cameras.normalization.camera(camera)))
+    found = parts(coarse.gaussians, members, reduced, antialias=coarse.plan.antialias)
+    chosen = [(view, part) for view, part in zip(cameras.training, found, strict=True) if part is not None]
+    room = Room.of(tile.job)
+    taken = BYTES_PER_PIXEL * sum(part.pixels for _, part in chosen)
+    files = None if fit_in_memory(taken, room.memory) else PixelFiles(room.folder)
+    with ThreadPoolExecutor(2) as pool:
+        for first in range(0, len(chosen), LOADED):
+            some = chosen[first : first + LOADED]
+            yield from pool.map(lambda each: _part_of(tile, each[0], each[1], size, files), some)
+            tile.job.emit(ProgressEvent(stage="loading", done=first + len(some), total=len(chosen)))
+    look_ups.forget()
+    decoded_panoramas.forget()
+
+
+def _part_of(tile: Tile, view: View, part: Part, size: int, files: PixelFiles | None) -> TrainingView:
+    """The part of one photo, in the light and with the camera of the coarse training."""
+    photo = load_view(view, size)
+    whole = TrainingView.of(photo, tile.cameras.normalization)
+    if view.name in tile.coarse.departures:
+        whole = whole.relit(tile.coarse.departures[view.name])
+    target = whole.full
+    camera = tile.coarse.corrected(view.name, target.camera)
+    viewmat = torch.as_tensor(camera.viewmat, dtype=torch.float32)
+    shown = part.of(replace(whole, levels={1: target._replace(camera=camera, viewmat=viewmat)}))
+    return shown if files is None else shown.placed(files)

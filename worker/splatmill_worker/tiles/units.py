@@ -1,0 +1,115 @@
+"""The plan of a scene in tiles: its units, what each needs, and which can be run now."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from splatmill.schema import TrainOptions
+
+FORMAT = 1
+"""Version of the plan's format and of what its units make: another one makes everything anew."""
+
+CAMERA_OPTIONS = ("sfm_effort", "matcher", "mapper", "max_video_frames", "scale", "seed", "start")
+"""Options that the cameras and the points follow from. The others do not change them."""
+
+State = Literal["done", "failed"]
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A part of the work, done by one process.
+
+    name: unique in its plan.
+    needs: names of the units whose output it reads.
+    spares: those of them that may have failed: the unit does without their output.
+    """
+
+    name: str
+    needs: tuple[str, ...] = ()
+    spares: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class ScenePlan:
+    """What the units of a scene follow from.
+
+    digest: of the files of the capture.
+    options: of the training.
+    tiles: how many parts the scene is trained in.
+    """
+
+    digest: str
+    options: TrainOptions
+    tiles: int
+
+    @property
+    def units(self) -> tuple[Unit, ...]:
+        """All units, each after those that it needs."""
+        tiles = tuple(f"tile-{number}" for number in range(1, self.tiles + 1))
+        return (
+            Unit("cameras"),
+            Unit("coarse", ("cameras",)),
+            *(Unit(name, ("cameras", "coarse")) for name in tiles),
+            Unit("scene", ("cameras", "coarse", *tiles), tiles),
+        )
+
+    def unit(self, name: str) -> Unit:
+        """The unit of that name. Raises KeyError."""
+        return next((unit for unit in self.units if unit.name == name), None) or _unknown(name)
+
+    def key(self, name: str, states: Mapping[str, State]) -> str:
+        """A digest of all that the output of a unit follows from: equal keys, equal outputs.
+
+        states: of the units, by which the scene without a failed tile has another key than the scene with it.
+        """
+        own: dict[str, Any] = {"format": FORMAT, "unit": name, "capture": self.digest}
+        options = self.options.model_dump(mode="json")
+        if name == "cameras":
+            own["options"] = {option: options[option] for option in CAMERA_OPTIONS}
+        else:
+            own |= {"options": options, "tiles": self.tiles}
+            own["failed"] = [spare for spare in self.unit(name).spares if states.get(spare) == "failed"]
+        return hashlib.sha256(json.dumps(own, sort_keys=True).encode()).hexdigest()[:16]
+
+    def ready(self, states: Mapping[str, State]) -> list[str]:
+        """Names of the units that have not ended and whose needs are met, in the order of the plan."""
+        return [
+            unit.name
+            for unit in self.units
+            if unit.name not in states and not self.missing(unit.name, states)
+        ]
+
+    def missing(self, name: str, states: Mapping[str, State]) -> list[str]:
+        """The units that must end before the unit `name` can be run."""
+        unit = self.unit(name)
+        return [
+            need
+            for need in unit.needs
+            if states.get(need) != "done" and not (need in unit.spares and states.get(need) == "failed")
+        ]
+
+    def as_dict(self) -> dict[str, Any]:
+        """The plan as JSON has it."""
+        return {
+            "format": FORMAT,
+            "digest": self.digest,
+            "options": self.options.model_dump(mode="json"),
+            "tiles": self.tiles,
+        }
+
+    @staticmethod
+    def from_dict(values: Mapping[str, Any]) -> ScenePlan:
+        """The plan of `as_dict`. Raises ValueError for another format, and KeyError or TypeError for other fields."""
+        if values["format"] != FORMAT:
+            raise ValueError(f"It has format {values['format']}, and this version reads format {FORMAT}.")
+        return ScenePlan(
+            str(values["digest"]), TrainOptions.model_validate(values["options"]), int(values["tiles"])
+        )
+
+
+def _unknown(name: str) -> Unit:
+    raise KeyError(name)
