@@ -22,7 +22,7 @@ from tests.support.paths import ROOT
 
 STUDIES = [
     *((name, "STUDY") for name in ("stability", "worst", "functions", "stiffness", "precision")),
-    *((name, "STUDY") for name in ("kernels", "scale", "sfm", "formats", "mesh", "live", "gabor")),
+    *((name, "STUDY") for name in ("kernels", "scale", "sfm", "formats", "mesh", "live", "gabor", "tiles")),
     ("kernels", "SIZES"),
     ("sfm", "GROWTH"),
     *((name, "STUDY") for name in ("abuse", "capacity", "fleet", "fuzz", "load", "openapi", "rq_alone")),
