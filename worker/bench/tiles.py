@@ -3,12 +3,12 @@
     splatmill bench tiles                              # still life and captures, four tiles: an hour or two
     splatmill bench tiles --scenes still --tiles 2 9 --steps 400 --dry
 
-Each scene is trained by the same options in one piece and in tiles, with the same cameras. Every unit is a process of its
-own, of which the CPU seconds and the largest memory are measured. "In turn" is the CPU time of all units; "longest
+Each scene is trained by the same options in one piece and in tiles, with the same cameras. Every unit is a process of
+its own, of which the CPU seconds and the largest memory are measured. "In turn" is the CPU time of all units; "longest
 chain" is what is left where each tile has a machine of its own: the coarse model, the longest tile and the joining.
 
-Expected before it was measured: the same PSNR within 0.3 dB, less on seams than elsewhere by a tenth, and for four tiles
-half of the memory of one piece in each unit beside that of the program.
+Expected before it was measured: the same PSNR within 0.3 dB, less on seams than elsewhere by a tenth, and for four
+tiles half of the memory of one piece in each unit beside that of the program.
 """
 
 from __future__ import annotations
@@ -158,7 +158,9 @@ def table(rows: list[Row]) -> str:
 
 
 def costs(rows: list[Row]) -> str:
-    head = "scene|tiles:|CPU seconds in one piece:|units in turn:|longest chain:|largest memory in one piece:|of a unit:"
+    head = (
+        "scene|tiles:|CPU seconds in one piece:|units in turn:|longest chain:|memory in one piece:|of a unit:"
+    )
     lines = [
         [
             one["scene"], row["tiles"], f"{one['cpu']:.0f}", f"{row['cpu']:.0f}", f"{row['chain']:.0f}",

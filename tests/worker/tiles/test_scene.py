@@ -31,15 +31,16 @@ OPTIONS = TrainOptions.model_validate({"steps": 200, "seed": 1, "max_gaussians":
 TILES = 2
 
 
-def new_plan(root: Path) -> Path:
-    still_life.posed_capture(root / "capture")
-    assert command.make_plan(root, OPTIONS.model_dump_json(), TILES) == 0
-    return root
+def planned(photos: Path, root: Path, **options: int) -> str:
+    """What the command prints that plans the scene with OPTIONS, but for these."""
+    asked = {**OPTIONS.model_dump(include={"steps", "seed", "max_gaussians", "holdout"}), **options}
+    flags = [text for name, value in asked.items() for text in (f"--{name.replace('_', '-')}", str(value))]
+    return done("splatmill", "plan", str(photos), "-o", str(root), "--tiles", str(TILES), *flags)
 
 
 def program(*arguments: str) -> subprocess.Popen[str]:
     return subprocess.Popen(
-        [sys.executable, "-m", "splatmill_worker", *arguments],
+        [sys.executable, "-m", *arguments],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -58,8 +59,8 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A plan all of whose units were done by one process after the other."""
 
     def make(root: Path) -> None:
-        new_plan(root)
-        done("unit", str(root))
+        planned(still_life.posed_capture(root / "photos"), root)
+        done("splatmill", "unit", str(root))
 
     return made_once(tmp_path_factory, "scene-in-tiles", make)
 
@@ -118,7 +119,7 @@ def test_the_bytes_are_the_same_whoever_does_the_units_and_one_of_them_is_killed
     whole: Path, tmp_path: Path
 ) -> None:
     root = copied(whole, tmp_path / "plan", without=("tile-1", "tile-2", "scene"))
-    killed = program("unit", str(root), "tile-1")
+    killed = program("splatmill", "unit", str(root), "tile-1")
     claims = root / "units"
     end = time.monotonic() + 100
     while not list(claims.glob("tile-1*.claim")) and time.monotonic() < end:
@@ -126,7 +127,7 @@ def test_the_bytes_are_the_same_whoever_does_the_units_and_one_of_them_is_killed
     time.sleep(0.5)
     killed.send_signal(signal.SIGKILL)
     killed.communicate()
-    both = [program("unit", str(root)) for _ in range(2)]
+    both = [program("splatmill", "unit", str(root)) for _ in range(2)]
     texts = [process.communicate(timeout=250)[0] for process in both]
     assert [process.returncode for process in both] == [0, 0], texts
     assert model_of(root) == model_of(whole)
@@ -135,7 +136,7 @@ def test_the_bytes_are_the_same_whoever_does_the_units_and_one_of_them_is_killed
 
 def test_a_unit_that_is_stopped_is_free_and_its_partners_are_kept(whole: Path, tmp_path: Path) -> None:
     root = copied(whole, tmp_path / "plan", without=("tile-2", "scene"))
-    process = program("unit", str(root))
+    process = program("splatmill", "unit", str(root))
     end = time.monotonic() + 100
     while not list((root / "units").glob("tile-2*.claim")) and time.monotonic() < end:
         time.sleep(0.05)
@@ -153,27 +154,26 @@ def test_a_failed_tile_leaves_a_scene_with_the_coarse_model_in_its_place(whole: 
     folder = PlanFolder.open(root)
     with folder.claimed("tile-1") as run:
         run.fail("Training diverged.", "Try another seed.")
-    text = done("unit", str(root))
+    text = done("splatmill", "unit", str(root))
     assert "tile-1     failed    Training diverged. Try another seed." in text
     report = json.loads((root / "scene" / "report.json").read_text())
     (warning,) = (each for each in report["warnings"] if "Tile 1 of 2" in each)
     assert "coarse model" in warning
     assert model_of(root) != model_of(whole)
-    # Done by its name, the tile takes its place.
-    done("unit", str(root), "tile-1")
-    done("unit", str(root))
-    assert model_of(root) == model_of(whole)
 
 
-def test_another_option_repeats_only_what_depends_on_it(
-    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_another_option_repeats_only_what_depends_on_it_and_other_photos_all(
+    whole: Path, tmp_path: Path
 ) -> None:
     root = copied(whole, tmp_path / "plan")
-    assert command.make_plan(root, OPTIONS.model_copy(update={"steps": 60}).model_dump_json(), TILES) == 0
-    assert "done already: cameras" in capsys.readouterr().out
+    assert "done already: cameras\n" in planned(whole / "photos", root, steps=60)
     assert PlanFolder.open(root).states() == {"cameras": "done"}
-    assert command.make_plan(root, OPTIONS.model_dump_json(), TILES) == 0
-    assert len(PlanFolder.open(root).states()) == 5
+    assert "done already: cameras, coarse, tile-1, tile-2, scene\n" in planned(whole / "photos", root)
+    fewer = tmp_path / "fewer"
+    shutil.copytree(whole / "photos", fewer)
+    (fewer / "images" / "00.png").unlink()
+    assert "done already" not in planned(fewer, root)
+    assert not (root / "capture" / "images" / "00.png").exists()
 
 
 def test_units_are_listed(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -217,7 +217,7 @@ def test_a_capture_without_cameras_fails_once_and_says_why(tmp_path: Path) -> No
     (tmp_path / "capture" / "images").mkdir(parents=True)
     (tmp_path / "capture" / "images" / "a.txt").write_text("no photo")
     assert command.make_plan(tmp_path, OPTIONS.model_dump_json(), 2) == 0
-    process = program("unit", str(tmp_path))
+    process = program("splatmill", "unit", str(tmp_path))
     text, _ = process.communicate(timeout=100)
     assert process.returncode == command.FAILED
     assert "cameras    failed" in text

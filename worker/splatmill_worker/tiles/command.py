@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -73,6 +74,9 @@ def _reported(run: Callable[[], int]) -> int:
     except WorkerError as failure:
         print(f"Error: {failure}", file=sys.stderr)
         return FAILED
+    except BrokenPipeError:  # `splatmill units DIR | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
     except OSError as error:
         print(f"Error: {error.filename or 'the folder'}: {error.strerror or error}.", file=sys.stderr)
         return UNWRITABLE
