@@ -13,6 +13,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -20,8 +21,9 @@ import pytest
 from splatmill.schema import ModelCameras, Report, TrainOptions
 from splatmill_worker import pipeline
 from splatmill_worker.splat.formats import registry
-from splatmill_worker.tiles import command
+from splatmill_worker.tiles import coarse_model, command
 from splatmill_worker.tiles.folder import PlanFolder
+from splatmill_worker.tiles.tile import tile_plan
 from tests.support import still_life
 from tests.support.made_once import made_once
 
@@ -98,6 +100,18 @@ def test_the_scene_is_as_good_as_in_one_piece(whole: Path, tmp_path: Path) -> No
     assert seams["seams"] > seams["coarse_seams"] - 0.2
     assert facts["scene"]["gaussians"] == sum(facts[f"tile-{number}"]["gaussians"] for number in (1, 2))
     assert min(facts[f"tile-{number}"]["gaussians"] for number in (1, 2)) > 200
+
+
+def test_a_tile_goes_on_where_the_coarse_model_stopped(whole: Path) -> None:
+    coarse = coarse_model.read(PlanFolder.open(whole).ended()["coarse"].path)
+    plan = tile_plan(coarse, free=500, photos=9)
+    assert coarse.steps == OPTIONS.steps / 2
+    assert plan.schedule.earlier_visits == coarse.steps / len(coarse.viewmats)
+    assert plan.schedule.reduced_until == 0
+    assert plan.max_gaussians == pytest.approx(3000 * 500 / coarse.gaussians.count, abs=1)
+    late = replace(plan.schedule, dropout=0.2, earlier_visits=150.0)
+    assert late.left_out(0.0) == pytest.approx(0.1)
+    assert late.left_out(50.0) == pytest.approx(0.2)
 
 
 def test_the_scene_has_the_files_of_a_training(whole: Path) -> None:

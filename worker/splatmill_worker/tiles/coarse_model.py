@@ -32,6 +32,7 @@ class Coarse:
     plan: that they were trained by.
     cells: of the tiles.
     most: the largest number of Gaussians of the whole scene.
+    steps: of its training.
     viewmats: world-to-camera matrices [4, 4] of the training photos as the training left them, by name.
     departures: logarithm of the exposure [3] of the training photos, by name; empty where their light stays as it is.
     """
@@ -40,6 +41,7 @@ class Coarse:
     plan: Plan
     cells: tuple[Cell, ...]
     most: int
+    steps: int
     viewmats: dict[str, Float]
     departures: dict[str, Float]
 
@@ -53,6 +55,7 @@ class Coarse:
             plan,
             tuple(cells),
             most,
+            trained.steps,
             {view.name: view.full.camera.viewmat for view in trained.views},
             departures,
         )
@@ -79,6 +82,7 @@ class Coarse:
             "plan": self.plan.as_dict(whole=True),
             "cells": [cell.as_dict() for cell in self.cells],
             "most": self.most,
+            "steps": self.steps,
         }
         atomic_write(folder / FACTS, json.dumps(document, indent=1))
 
@@ -94,6 +98,7 @@ def read(folder: Path) -> Coarse:
         Plan.from_dict(document["plan"]),
         tuple(Cell.from_dict(values) for values in document["cells"]),
         int(document["most"]),
+        int(document["steps"]),
         viewmats,
         departures,
     )

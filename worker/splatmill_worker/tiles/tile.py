@@ -84,7 +84,7 @@ def train_tile(tile: Tile, stages: Stages) -> TileResult:
     within = whole.select(core)
     if not views or not within.count:
         return TileResult(within, {"gaussians": within.count, "steps": 0, "photos": len(views)})
-    plan = _plan(coarse, int(free.sum()), len(views))
+    plan = tile_plan(coarse, int(free.sum()), len(views))
     engine = open_engine(
         whole.select(free), plan.kernels, clustered=plan.cluster_culling, context=whole.select(~free)
     )
@@ -133,7 +133,7 @@ def _some(rows: Tensor, limit: int = 100_000) -> Tensor:
     return rows[:: max(1, math.ceil(len(rows) / limit))]
 
 
-def _plan(coarse: Coarse, free: int, photos: int) -> Plan:
+def tile_plan(coarse: Coarse, free: int, photos: int) -> Plan:
     """The plan of a tile of `free` Gaussians that so many photos show: that of the coarse model, from a model on."""
     plan, schedule = coarse.plan, coarse.plan.schedule
     most = max(free, math.ceil(coarse.most * free / max(1, coarse.gaussians.count)))
@@ -153,7 +153,9 @@ def _plan(coarse: Coarse, free: int, photos: int) -> Plan:
         stops_when_flat=plan.stops_when_flat and aside is not None,
         target_psnr=plan.target_psnr if aside is not None else None,
         lpips=False,
-        schedule=replace(schedule, resolution=((0, 1),)),
+        schedule=replace(
+            schedule, resolution=((0, 1),), earlier_visits=coarse.steps / max(1, len(coarse.viewmats))
+        ),
     )
 
 

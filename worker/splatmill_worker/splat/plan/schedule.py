@@ -38,6 +38,8 @@ class Schedule:
         of the far shell is hidden from the photos, and decay would remove it. None: no such distance.
     annealing: how the learning rates fall.
     dropout: largest share of the Gaussians that a step leaves out at random; see `left_out`.
+    earlier_visits: steps on each photo before the first of this run, for `dropout`: a tile starts from a model that has
+        been trained on them.
     ends_at: steps after which few photos from one side end the run, whatever its budget; None where they do not.
     """
 
@@ -54,6 +56,7 @@ class Schedule:
     dropout: float = 0.0
     longest: int | None = None
     ends_at: int | None = None
+    earlier_visits: float = 0.0
 
     @property
     def reduced_until(self) -> int:
@@ -65,11 +68,11 @@ class Schedule:
         return [factor for first, factor in self.resolution if first < step][-1]
 
     def left_out(self, visits: float) -> float:
-        """The share of the Gaussians that a step leaves out at random after `visits` steps on each photo.
+        """The share of the Gaussians that a step leaves out at random after `visits` steps of this run on each photo.
 
-        It grows from 0 at MANY_VISITS to `dropout` at twice as many.
+        It grows from 0 at MANY_VISITS, with those of earlier runs, to `dropout` at twice as many.
         """
-        return self.dropout * min(1.0, max(0.0, visits / MANY_VISITS - 1.0))
+        return self.dropout * min(1.0, max(0.0, (self.earlier_visits + visits) / MANY_VISITS - 1.0))
 
     def unsettled(self, step: int, progress: float) -> bool:
         """Whether a densification was at most SETTLING of the way to the next one ago: opacities are still decayed."""

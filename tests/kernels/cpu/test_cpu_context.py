@@ -15,7 +15,7 @@ from splatmill_worker.kernels.cpu.step import Step
 from splatmill_worker.splat.engine.autograd import AutogradEngine
 from splatmill_worker.splat.engine.open import open_engine
 from splatmill_worker.splat.gaussians import Gaussians
-from tests.kernels.test_cpu_clusters import HEIGHT, NAMES, RATES, WIDTH, K, camera, street
+from tests.kernels.cpu.test_cpu_clusters import HEIGHT, NAMES, RATES, WIDTH, K, camera, street
 
 SCORES = ("plain_sum", "visible_count", "max_extent")
 BACKGROUND = torch.tensor([0.2, 0.4, 0.6])
