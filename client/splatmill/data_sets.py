@@ -84,6 +84,7 @@ OTHER_CAMERAS = {
     "NSVF, SRN, ScanNet": ("pose/*.txt", "intrinsics.txt"),
     "Nerfies, HyperNeRF": ("camera/*.json",),
     "ARKitScenes": ("*.traj", "*.pincam"),
+    "Stray Scanner": ("odometry.csv",),
     "3D Scanner App": ("frame_*.json",),
     "Tanks and Temples, Open3D": ("*_sfm.log", "trajectory.log"),
     "KITTI": ("poses.txt",),

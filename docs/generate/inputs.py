@@ -8,7 +8,7 @@ from splatmill.data_sets import CAMERA_PROGRAMS, MAX_DEPTH, OTHER_CAMERAS, PLACE
 from splatmill.schema.files.formats import MODEL_FORMATS, POINT_FORMATS
 from splatmill.schema.files.masks import MASK_BEGINNINGS, MASK_ENDINGS, MASK_FOLDERS
 from splatmill.schema.files.names import MAX_PART_BYTES, MAX_PARTS
-from splatmill.schema.files.other_pictures import OTHER_FOLDERS, UNUSED
+from splatmill.schema.files.other_pictures import CONFIDENCE, DEPTH, OTHER_FOLDERS, UNUSED
 from splatmill.schema.files.outputs import OUTPUT_MARKS, OUTPUT_MEDIA
 from splatmill.schema.files.photos import (
     ARCHIVE_SUFFIXES,
@@ -18,7 +18,7 @@ from splatmill.schema.files.photos import (
     UNREAD_KINDS,
     VIDEO_FORMATS,
 )
-from splatmill_worker.images import guarded, mask_levels, prepare
+from splatmill_worker.images import depth_maps, guarded, mask_levels, prepare
 from splatmill_worker.images.archives import archive, zip_names
 from splatmill_worker.images.colors.colors import PRIMARIES, TRANSFERS, Colors
 from splatmill_worker.images.colors.photo_colors import PhotoColors
@@ -26,11 +26,13 @@ from splatmill_worker.images.lens import PANORAMA, PINHOLE_MODELS
 from splatmill_worker.images.no_photo import TRAITS
 from splatmill_worker.images.overlays import overlay
 from splatmill_worker.images.panoramas import faces, panoramas
-from splatmill_worker.pipeline import scan_fit
+from splatmill_worker.pipeline import given_depth, scan_fit
 from splatmill_worker.readers import scan
 from splatmill_worker.readers.colmap_files import MODELS
 from splatmill_worker.readers.programs.shots import MAX_LENGTH_ERROR
 from splatmill_worker.scene import MIN_SHOWN
+from splatmill_worker.sfm.depth import pixels, unit
+from splatmill_worker.sfm.depth import points as depth_points
 from splatmill_worker.sfm.posed import colmap_model, model_files, polycam, same_bytes
 from splatmill_worker.sfm.posed.judged import points, triangulation
 from tests.support.inputs.example import answer
@@ -39,7 +41,16 @@ from tests.support.inputs.table import EXAMPLES
 
 def page() -> str:
     """The page of inputs."""
-    parts = [*_introduction(), *_photos(), *_masks(), *_cameras(), *_points(), *_models(), *_answers()]
+    parts = [
+        *_introduction(),
+        *_photos(),
+        *_masks(),
+        *_cameras(),
+        *_points(),
+        *_depth(),
+        *_models(),
+        *_answers(),
+    ]
     return "\n".join(part if part.startswith(("#", "|")) else _filled(part) for part in parts)
 
 
@@ -144,10 +155,10 @@ def _photos() -> list[str]:
             ],
         ),
         f"""Without cameras, pictures in folders of {", ".join(UNUSED)} are not used where photos lie beside
-        them, and a sentence names them; masks are used, and thumbnails compared with the photos. If all pictures lie in
-        such folders, or PATH is one, both readings are named and nothing is trained. The job fails too, whatever
-        the folder is called, if all pictures are of these kinds by their pixels. A picture with a single channel of 16
-        bits among photos in colour is left out.""",
+        them, and a sentence names them; masks and [depth maps](#depth-maps) are used, and thumbnails compared with the
+        photos. If all pictures lie in such folders, or PATH is one, both readings are named and nothing is
+        trained. The job fails too, whatever the folder is called, if all pictures are of these kinds by their
+        pixels. A picture with a single channel of 16 bits among photos in colour is left out.""",
     ]
 
 
@@ -252,7 +263,8 @@ def _cameras() -> list[str]:
         photos, without its points. The principal point is the middle of the photo.
 
         - **Record3D**: the `.r3d`, or its folder or an export with `metadata.json`, with the photos called by their
-        numbers. The depth maps are not used.
+        numbers. The depth maps in an `.r3d` are compressed (LZFSE) and not read; those of its export as EXR are not
+        read either.
 
         A frame without a matrix is left out with a warning. Up to {model_files.MOST_FAULTY:.0%} of the poses are left
         out if no camera can have them (mirrored, sheared, not finite); with more, the job fails and names the first. It
@@ -313,6 +325,47 @@ def _points() -> list[str]:
         of the photo that shows its place closest, or for each of larger cells where more would stay than
         {scan_fit.STARTED:.0%} of the Gaussians that the photos resolve, {scan_fit.FEW:,} in any case and
         {points.MOST_LOOSE:,} at most. The log has the numbers.""",
+    ]
+
+
+def _depth() -> list[str]:
+    few = unit.READINGS
+    return [
+        "## Depth maps\n",
+        f"""Depth maps of phones and RGB-D cameras beside the photos give points to start from, in addition to those
+        above. The map of `images/a.jpg` is `depth/a.png` in one of the folders
+        {choices(f"{name}/" for name in OTHER_FOLDERS[DEPTH])}, at any depth, or what a frame of `transforms.json` has
+        as `depth_file_path`. The map of a frame of a video is called by the number of the frame. A map of
+        confidence has the same name in {choices(f"{name}/" for name in OTHER_FOLDERS[CONFIDENCE])}. The page takes them
+        in a folder or a zip, as the command does.
+
+        A map is a PNG or TIFF with a single channel of 16 bits, or of 32 as integers or floating-point numbers: the
+        distance along the optical axis. It has the shape of its photo, and any size. 0, {depth_maps.LARGEST} of 16
+        bits, and what is not finite is no distance. A map is left out by name if it is cut off, empty, of another
+        shape, or of 8 bits or in colours, as maps are that are drawn to be looked at.
+
+        Pixels count if their confidence is the highest that occurs in the maps of the capture (2 of 0, 1 and 2, as of
+        Stray Scanner; 255 of 0, 54 and 255, as of Polycam; with more than {given_depth.FEW_LEVELS} levels, from half of
+        the highest), and if they differ from their neighbours by less than {pixels.EDGE:.0%}. Of all maps together, up
+        to {depth_points.MOST:,} evenly chosen pixels become points, in float64, with the colour of their photo there.
+        They are thinned as a scan is. Those stay whose colour another photo shows; if the other photos do so less than
+        {scan_fit.LEAST_SHARE:.0%} as often, above chance, as for the scene's own points, none is used. Maps of held-out
+        photos and of panoramas are not read.
+
+        The unit of the maps is measured: it is the median ratio of the depths of the scene's own points and the levels
+        at them. If half of the ratios differ from it by more than {unit.SPREAD:.0%}, no map is used; a map in which
+        they do is left out. A unit that is stated (`depth_unit_scale_factor`; a millimetre by default where frames name
+        maps, as in nerfstudio, and in Polycam's raw data) is used as it is if it is the same up to {unit.SAME:.0%}; if
+        it is not, the measured one is used, and the log has both. With fewer than {unit.FEWEST} such points, a
+        stated unit is used, and maps without one are not: a sentence names their distances in {" and in ".join(few)}.
+        So maps may be in millimetres, as of Polycam, Stray Scanner, ScanNet and Redwood, or in 1/5000 m, as of TUM
+        RGB-D, if their names are those of the photos.
+
+        Recovered cameras are treated alike. If nothing else gives a unit to the model, maps with confidence give it
+        metres, since phones write millimetres. No depth map ends a job: the report says in a warning why none is
+        used, and has the numbers (`depth_maps`, `depth_unit`, `depth_points_used`). Maps beside their photos
+        (`a.depth.png`), in `.npy`, `.pgm` or EXR, and those of TUM RGB-D whose names are other times than those of the
+        photos, are not read.""",
     ]
 
 

@@ -142,7 +142,11 @@ class Admission:
             )
         photos = all(entry.path.lower().endswith(PHOTO_SUFFIXES) for entry in images)
         poses = self.storage.entries(layout.capture_files(capture_id, Role.poses))
-        posed = any(not is_start_file(entry.path) for entry in poses)  # a model to start from is no pose
+        # A model to start from is no pose, and neither is a depth map.
+        posed = any(
+            not is_start_file(entry.path) and not entry.path.lower().endswith(PHOTO_SUFFIXES)
+            for entry in poses
+        )
         if len(images) == 1 and photos and not posed:
             raise ProblemError(
                 "too_few_images",

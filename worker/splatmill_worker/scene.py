@@ -207,6 +207,7 @@ class View:
     other: the view with the other `upright`, where the camera fits the photo both ways; None: it is decided.
     shown_from: level of the mask, 0 to 255, from which a pixel is shown.
     face: which part of the photo and of its mask the view shows, where that is a panorama; None: all of it.
+    depth: path of its depth map, where the file with the cameras names one.
     """
 
     name: str
@@ -219,6 +220,7 @@ class View:
     other: View | None = None
     shown_from: int = MIN_SHOWN
     face: Face | None = None
+    depth: Path | None = None
 
     @property
     def photo(self) -> str:
@@ -264,6 +266,7 @@ class Scene:
     warnings: sentences for the user about what is probably wrong.
     overlays: what is drawn over the photos, and masked.
     frame: how the world was chosen; None where it is that of given poses, or of a reconstruction as it came out.
+    depth_unit: length in the world of one level of the depth maps, as the file with the cameras says; None: not stated.
     """
 
     views: tuple[View, ...]
@@ -279,6 +282,7 @@ class Scene:
     warnings: tuple[str, ...] = ()
     overlays: tuple[Overlay, ...] = ()
     frame: ModelFrame | None = None
+    depth_unit: float | None = None
 
     @property
     def centers(self) -> Float:

@@ -26,7 +26,13 @@ from splatmill.data_sets import (
 from splatmill.errors import NothingToUpload
 from splatmill.schema.files.masks import masks_beside, without_mask_folder
 from splatmill.schema.files.names import UnsafeName, readings, safe_name, storable_name
-from splatmill.schema.files.other_pictures import beside_photos, kind_of_folder, no_photos
+from splatmill.schema.files.other_pictures import (
+    MEASURED,
+    NO_PHOTOS,
+    beside_photos,
+    kind_of_folder,
+    no_photos,
+)
 from splatmill.schema.files.other_pictures import remarks as other_remarks
 from splatmill.schema.files.outputs import own_outputs
 from splatmill.schema.files.photos import ARCHIVE_SUFFIXES, PHOTO_SUFFIXES, VIDEO_SUFFIXES, unread
@@ -103,12 +109,14 @@ class Found:
         images = [_suffix(file.name) for file in self.files if file.role is Role.images]
         videos = sum(suffix in VIDEO_SUFFIXES for suffix in images)
         archives = sum(suffix in ARCHIVE_SUFFIXES for suffix in images)
+        maps = sum(file.role is Role.poses and _is_image(file.name) for file in self.files)
         kinds = {
             "photo": len(images) - videos - archives,
             "video": videos,
             "zip archive": archives,
             "mask": self.count(Role.masks),
-            "pose file": self.count(Role.poses),
+            "depth or confidence map": maps,
+            "pose file": self.count(Role.poses) - maps,
         }
         return [counted(number, kind) for kind, number in kinds.items() if number]
 
@@ -134,8 +142,8 @@ def find_files(path: str | os.PathLike[str]) -> Found:
     points that they name, and COLMAP models. All of this may lie some folders down: see `data_sets.find_cameras`.
     Hidden files and folders are ignored. Videos and zip archives are used only where there are no photos; a zip of
     cameras alone goes along with photos that have none. Pictures in a folder of results are no photos
-    (`splatmill.schema.files.outputs`), and neither are those in a folder of depth maps, for example, if no cameras are
-    given (`splatmill.schema.files.other_pictures`).
+    (`splatmill.schema.files.outputs`), and neither are those in a folder of normal maps, for example, if no cameras are
+    given (`splatmill.schema.files.other_pictures`). Depth maps and maps of confidence are poses.
 
     A file whose name the service does not accept gets another one, or is left out. What is no regular file, or cannot
     be read, is left out too (`data_sets.walk`).
@@ -175,20 +183,22 @@ def find_files(path: str | os.PathLike[str]) -> Found:
         masks[name] = name.removeprefix(photo_root if name.startswith(photo_root) else top)
     poses = _poses(cameras, names)
     others: dict[str, str] = {}
+    maps = _maps(pictures, names, documents, cameras.top)
     if not poses:
-        inside = [name for name in pictures if name.startswith(photo_root)]
+        inside = [name for name in pictures if name.startswith(photo_root) and name not in maps]
         said = no_photos(inside)
         if not photo_root and not any(map(kind_of_folder, inside)):
             said = no_photos([f"{root.resolve().name}/{name}" for name in inside])
         if said:
             raise NothingToUpload(said)
         others = beside_photos(inside)
-    zipped = _cameras_in_zips(root, names) if pictures else {}
+    photos = any(name not in maps for name in pictures)
+    zipped = _cameras_in_zips(root, names) if photos else {}
     along = set() if poses else {name for name, (_, has_photos) in zipped.items() if not has_photos}
     points = _named(documents, "ply_file_path", cameras.top).intersection(names)
     poses |= {name: name.removeprefix(cameras.top) for name in points if _suffix(name) == ".ply"}
-    posed = bool(poses or (pictures and cameras.programs))
-    if pictures:
+    posed = bool(poses or (photos and cameras.programs))
+    if photos:
         poses |= {name: name for name in (*cameras.programs, *named_by_job(names))}
     files: list[LocalFile] = []
     ignored: list[str] = []
@@ -199,6 +209,8 @@ def find_files(path: str | os.PathLike[str]) -> Found:
         try:
             if name in masks:
                 files.append(_local(Role.masks, masks[name], root / name))
+            elif name in maps:
+                files.append(_local(Role.poses, name.removeprefix(top), root / name))
             elif name.startswith(photo_root) and _is_image(name) and name not in others:
                 files.append(_local(Role.images, name.removeprefix(photo_root), root / name))
             elif name in along:
@@ -228,7 +240,7 @@ def find_files(path: str | os.PathLike[str]) -> Found:
         raise NothingToUpload(capture_files.left_out[0][1], "Rename the files.")
     remarks = around + _left_out(unreadable) + unread(ignored) + ([] if posed else unread_cameras(names))
     beside = [name for name in ignored if _suffix(name) in VIDEO_SUFFIXES + ARCHIVE_SUFFIXES]
-    if cameras.programs and not pictures:
+    if cameras.programs and not photos:
         remarks.append(
             f"Cameras are read where photos have the names in them; beside a video or a zip these files are not used: "
             f"{listed(cameras.programs)}."
@@ -382,6 +394,22 @@ def _masks(pictures: list[str], top: str, photo_root: str) -> dict[str, str]:
         name: whole.removeprefix(photo_root if whole.startswith(photo_root) else top)
         for name, whole in masks.items()
     }
+
+
+def _maps(
+    pictures: list[str], names: list[str], documents: Iterable[Mapping[str, Any]], top: str
+) -> frozenset[str]:
+    """Return the local names of the depth maps and the maps of confidence beside photos or a video; none without them.
+
+    They lie in folders of such names, or frames name them. What frames name as a photo is none.
+    """
+    maps = {name for name in pictures if kind_of_folder(name.removeprefix(top)) in MEASURED}
+    maps |= _named(documents, "depth_file_path", top).intersection(pictures)
+    maps -= _named(documents, "file_path", top)
+    media = any(_suffix(name) in VIDEO_SUFFIXES for name in names)
+    photos = [name for name in pictures if name not in maps]
+    beside = any(kind_of_folder(name.removeprefix(top)) not in (*NO_PHOTOS, "masks") for name in photos)
+    return frozenset(maps if media or beside else ())
 
 
 def _poses(cameras: Cameras, names: list[str]) -> dict[str, str]:

@@ -50,7 +50,7 @@ from splatmill.schema import (
     describe_options,
 )
 from splatmill.schema.files.formats import POINT_FORMATS
-from splatmill.schema.files.other_pictures import OTHER_FOLDERS, UNUSED
+from splatmill.schema.files.other_pictures import MEASURED, OTHER_FOLDERS, UNUSED
 from splatmill_server.access.caller import Caller, Who
 from splatmill_server.access.permission import needs
 from splatmill_server.base import metrics, scrape
@@ -102,6 +102,7 @@ def get_info(service: Shared, who: Who) -> Info:
             mask_beginnings=list(MASK_BEGINNINGS),
             other_folders={what: list(names) for what, names in OTHER_FOLDERS.items()},
             unused_folders=list(UNUSED),
+            depth_folders=list(MEASURED),
             output_marks=list(OUTPUT_MARKS),
             output_media=list(OUTPUT_MEDIA),
             unread=[Unread(**asdict(kind)) for kind in UNREAD_KINDS],

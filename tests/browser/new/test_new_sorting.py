@@ -63,6 +63,9 @@ TREES = {
     "half a model": "images/a.jpg sparse/0/images.txt sparse/0/points3D.txt",
     "cameras that are not needed": "images/a.jpg transforms.json cameras.xml",
     "videos": "a.mov b.webm",
+    "depth maps": "rgb/a.jpg depth/a.png Confidence/a.png normals/a.png",
+    "depth maps of a video": "rgb.mp4 depth/000000.png confidence/000000.png odometry.csv",
+    "nothing but depth maps and masks": "depth/a.png masks/a.png",
     "a zip": "photos.zip",
     "code points": "é.jpg Z.jpg a.jpg \U0001f600.jpg ﬁ.jpg",
 }
@@ -78,6 +81,9 @@ TRANSFORMS = {
                 {"file_path": "images/b.jpg", "mask_path": ".\\images\\obj_1.png"},
             ],
         }
+    ),
+    "depth maps that frames name": json.dumps(
+        {"frames": [{"file_path": "images/a.jpg", "depth_file_path": "sensor/a.png"}]}
     ),
     "photos that frames name": json.dumps(
         {"frames": [{"file_path": "images/a.jpg"}, {"file_path": "more/b.jpg"}]}
@@ -100,6 +106,7 @@ TREES |= {
 TREES |= {
     "masks that frames name": "set/images/a.jpg set/images/b.jpg set/images/obj_1.png set/sam/obj_0.png "
     "set/sam/other.png set/points.ply set/transforms.json",
+    "depth maps that frames name": "set/images/a.jpg set/sensor/a.png set/depth/b.png set/transforms.json",
     "photos that frames name": "images/a.jpg more/b.jpg more/c.jpg transforms.json",
 }
 

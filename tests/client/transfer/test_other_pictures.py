@@ -6,6 +6,7 @@ Not proven here: that the page says the same (tests/browser/new/test_new.py), an
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -42,19 +43,48 @@ def test_a_folder_of_nothing_but_such_folders_is_refused(tmp_path: Path) -> None
         find_files(tmp_path)
 
 
-def test_maps_beside_photos_are_not_used_and_named(tmp_path: Path) -> None:
-    tree(tmp_path, "rgb/0.jpg", "depth/0.png", "depth/1.png", "Normals/0.png", "masks/0.png", "thumbs/0.jpg")
+def test_maps_beside_photos_are_no_photos(tmp_path: Path) -> None:
+    tree(
+        tmp_path,
+        "rgb/0.jpg",
+        "depth/0.png",
+        "confidence/0.png",
+        "Normals/0.png",
+        "masks/0.png",
+        "thumbs/0.jpg",
+    )
     found = find_files(tmp_path)
     assert {(file.role, file.name) for file in found.files} == {
         (Role.images, "rgb/0.jpg"),
         (Role.images, "thumbs/0.jpg"),
         (Role.masks, "0.png"),
+        (Role.poses, "depth/0.png"),
+        (Role.poses, "confidence/0.png"),
     }
-    assert found.ignored == ("Normals/0.png", "depth/0.png", "depth/1.png")
+    assert found.contents() == ["2 photos", "1 mask", "2 depth or confidence maps"]
+    assert found.ignored == ("Normals/0.png",)
     assert found.remarks == (
-        "2 pictures are taken for depth maps by the name of the folder and not used: depth/0.png and 1 more.",
         "1 picture is taken for normal maps by the name of the folder and not used: Normals/0.png.",
     )
+
+
+def test_depth_maps_of_a_data_set_go_along_by_their_folder_or_by_their_frames(tmp_path: Path) -> None:
+    tree(tmp_path / "set", "images/0.jpg", "images/1.jpg", "depths/0.png", "sensor/1.png", "rest/2.png")
+    frames = [{"file_path": "images/0.jpg"}, {"file_path": "images/1.jpg", "depth_file_path": "sensor/1.png"}]
+    (tmp_path / "set/transforms.json").write_text(json.dumps({"frames": frames}))
+    poses = {file.name for file in find_files(tmp_path).files if file.role is Role.poses}
+    assert poses == {"transforms.json", "depths/0.png", "sensor/1.png"}
+
+
+def test_depth_maps_go_along_with_a_video(tmp_path: Path) -> None:
+    tree(tmp_path, "rgb.mp4", "depth/000000.png", "confidence/000000.png", "odometry.csv")
+    found = find_files(tmp_path)
+    assert [file.name for file in found.files if file.role is Role.images] == ["rgb.mp4"]
+    assert {file.name for file in found.files if file.role is Role.poses} >= {
+        "depth/000000.png",
+        "confidence/000000.png",
+    }
+    assert any("The cameras of Stray Scanner in odometry.csv are not read" in each for each in found.remarks)
 
 
 @pytest.mark.parametrize(

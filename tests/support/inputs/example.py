@@ -11,11 +11,12 @@ from typing import Literal
 
 from splatmill.data_sets import TwoDataSets
 from splatmill.errors import NothingToUpload
-from splatmill.schema import Role
+from splatmill.schema import Role, TrainOptions
 from splatmill.transfer.local_capture import find_files
 from splatmill_worker.errors import WorkerError
 from splatmill_worker.images.masks import mask_folder
 from splatmill_worker.images.prepare import names_remark, prepare
+from splatmill_worker.pipeline.given_depth import with_depth
 from splatmill_worker.scene import Scene, omissions
 from splatmill_worker.sfm import posed
 from splatmill_worker.sfm.posed import zipped
@@ -86,6 +87,9 @@ def _read(capture: Path, work: Path) -> tuple[int, str, int, list[str]]:
     given = posed.find(capture) or zipped.cameras_beside(capture, work)
     if given is not None:
         scene: Scene = given.load()
+        names = {view.name for view in scene.views}
+        quiet = lambda *_: None  # noqa: E731
+        scene = with_depth(scene, names, capture, work, TrainOptions(), quiet, lambda: False)
         masks = sum(view.mask is not None for view in scene.views)
         return len(scene.views), scene.source, masks, [*scene.warnings, *omissions(scene.left_out)]
     prepared = prepare(capture / Role.images, mask_folder(capture), work)

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from tests.support import depth_sets
 from tests.support.files import unmarked_zip
 from tests.support.files.program_files import PROGRAMS, SIZE, record3d
 from tests.support.inputs.example import Example, Kind
@@ -253,9 +254,23 @@ def polycam(folder: Path) -> None:
         (folder / f"keyframes/cameras/{k}.json").write_text(json.dumps(camera))
 
 
+def polycam_with_depth(folder: Path) -> None:
+    polycam(folder)
+    for kind in ("depth", "confidence"):
+        (folder / "keyframes" / kind).mkdir()
+    for k in range(COUNT):
+        Image.fromarray(np.full((24, 32), 1500, np.uint16)).save(folder / f"keyframes/depth/{k}.png")
+        Image.fromarray(np.full((24, 32), 255, np.uint8)).save(folder / f"keyframes/confidence/{k}.png")
+
+
 def half_a_model(folder: Path) -> None:
     colmap(folder)
     (folder / "sparse/0/cameras.txt").unlink()
+
+
+def measured(changed: Callable[[np.ndarray], np.ndarray] = lambda levels: levels, named: bool = True) -> Make:
+    """The still life with depth maps in the folder depth, with their confidence."""
+    return lambda folder: depth_sets.data_set(folder, 6, (96, 72), change=changed, named=named)
 
 
 def with_depth(folder: Path) -> None:
@@ -359,7 +374,10 @@ EXAMPLES: tuple[Example, ...] = (
         "used with a remark",
     ),
     Example("Photos", "nothing but a text", alone("notes.txt"), "refused"),
-    Example("Photos", "depth maps in a folder depth", maps("depth/{}.png", True, True), "used with a remark"),
+    Example("Photos", "depth maps in a folder depth", maps("depth/{}.png", True, True), "used"),
+    Example(
+        "Photos", "normal maps in a folder normals", maps("normals/{}.png", beside=True), "used with a remark"
+    ),
     Example("Photos", "nothing but depth maps of 16 bits", maps("{}.png", True), "refused"),
     Example(
         "Photos",
@@ -448,8 +466,34 @@ EXAMPLES: tuple[Example, ...] = (
     Example("Cameras", "one mirrored pose of twelve", with_frames(_set(MIRRORED, 5)), "used with a remark"),
     Example("Cameras", "two mirrored poses of twelve", with_frames(_set(MIRRORED, 5, 6)), "refused"),
     Example("Cameras", "a depth picture beside each photo", with_depth, "used with a remark"),
+    Example("Cameras", "depth maps in millimetres, with their confidence", measured(), "used"),
+    Example("Cameras", "depth maps of no stated unit", measured(named=False), "used with a remark"),
+    Example(
+        "Cameras",
+        "depth maps that are called millimetres and are 1/5000 m",
+        measured(lambda levels: np.minimum(5.0 * levels, 65535).astype(np.uint16)),
+        "used with a remark",
+    ),
+    Example(
+        "Cameras",
+        "depth maps of 8 bits, to be looked at",
+        measured(lambda levels: (levels >> 6).astype(np.uint8)),
+        "used with a remark",
+    ),
+    Example(
+        "Cameras",
+        "depth maps of another shape",
+        measured(lambda levels: levels[:, 20:]),
+        "used with a remark",
+    ),
     Example("Cameras", "a Blender data set with a validation set", blender, "used with a remark"),
     Example("Cameras", "the raw data of Polycam", polycam, "used"),
+    Example(
+        "Cameras",
+        "the raw data of Polycam, with depth maps and their confidence",
+        polycam_with_depth,
+        "used",
+    ),
     *(
         Example("Cameras", f"cameras of {program}", partial(of_program, program), kind)
         for program, kind in PROGRAM_ANSWERS.items()

@@ -8,6 +8,7 @@ from splatmill.schema import LogEvent
 from splatmill_worker.images.panoramas import faces
 from splatmill_worker.pipeline.capture import posed_scene
 from splatmill_worker.pipeline.events import progress_events
+from splatmill_worker.pipeline.given_depth import with_depth
 from splatmill_worker.pipeline.holdout.split import honest_split
 from splatmill_worker.pipeline.job import Job
 from splatmill_worker.pipeline.live import LiveCameras, placement_of, store_placement
@@ -54,6 +55,18 @@ def recover_cameras(job: Job, stages: Stages) -> Cameras:
         left_out=(*scene.left_out, *parts.left_out),
         warnings=(*scene.warnings, *parts.warnings),
     )
+    with stages.measured("sfm"):
+        scene = with_depth(
+            scene,
+            {view.name for view in training},
+            job.capture,
+            job.workdir,
+            job.options,
+            progress_events(job.emit),
+            job.cancelled,
+        )
+    views = {view.name: view for view in scene.views}
+    training, held_out = (tuple(views[view.name] for view in part) for part in (training, held_out))
     for note in scene.notes:
         job.emit(LogEvent(message=note))
     for warning in scene.warnings:

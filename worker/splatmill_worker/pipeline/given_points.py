@@ -17,7 +17,7 @@ from splatmill_worker.errors import Refusal
 from splatmill_worker.images.decoding import decoders
 from splatmill_worker.pipeline import scan_fit
 from splatmill_worker.readers import scan
-from splatmill_worker.scene import PointViews, Scene
+from splatmill_worker.scene import Scene
 from splatmill_worker.sfm.alignment import LIBRARY
 from splatmill_worker.sfm.callbacks import OnProgress
 from splatmill_worker.sfm.world.frame import in_metres
@@ -109,31 +109,8 @@ def with_given_points(
             f"{path.name} was aligned to the photos: {fit.sentence} One of its units is {fit.alignment.scale:.4g} of "
             "the model."
         )
-    scene = replace(
-        scene,
-        points=np.concatenate([scene.points, fit.points]),
-        colors=np.concatenate([scene.colors, fit.colors]),
-        **_tracks(scene, fit),
-        notes=(*scene.notes, *notes),
-        facts=scene.facts | facts,
-    )
+    scene = replace(scan_fit.joined(scene, fit), notes=(*scene.notes, *notes), facts=scene.facts | facts)
     return _in_metres(scene, path, fit.alignment)
-
-
-def _tracks(scene: Scene, fit: scan_fit.Fit) -> dict[str, Any]:
-    """The tracks of the scene's points and of those of the scan after them; none where the scene's are not known, since
-    those of the scan alone would mean that no photo shows the others."""
-    if scene.point_views is None:
-        return {"point_views": None, "point_errors": None, "track_lengths": None}
-    added = scan_fit.point_views(scene, fit.points)
-    offsets, views = scene.point_views
-    offsets = np.concatenate([offsets, offsets[-1] + added.offsets[1:]])
-    errors = scene.point_errors
-    return {
-        "point_views": PointViews(offsets, np.concatenate([views, added.views])),
-        "point_errors": None if errors is None else np.append(errors, np.full(len(fit.points), np.nan)),
-        "track_lengths": np.diff(offsets).astype(np.int32),
-    }
 
 
 def _in_metres(scene: Scene, path: Path, alignment: scan_fit.Alignment | None) -> Scene:

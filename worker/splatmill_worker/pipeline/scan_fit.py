@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -72,13 +73,20 @@ class Fit:
 
 
 def as_it_lies(
-    scene: Scene, points: Float, colors: Colors, side: int | None, cancelled: Callable[[], bool]
+    scene: Scene,
+    points: Float,
+    colors: Colors,
+    side: int | None,
+    cancelled: Callable[[], bool],
+    *,
+    from_photos: bool = False,
 ) -> Fit:
     """The points of a scan in the coordinates of the scene's cameras, judged by the photos as aligned ones are; where
     the scene has no points of its own, or the scan no colours, as points that come with a data set are.
 
     points, colors: of the scan [n,3].
     side: pixels of the longest side of the photos that are trained on; None: their full size.
+    from_photos: whether each colour is that of one of the photos, which then says nothing of its point.
     """
     views = [view for view in scene.views if view.split != "test"]
     rows, pixels = posed.resolved(points, posed.footprints(points, views, side, cancelled), most(views, side))
@@ -86,8 +94,8 @@ def as_it_lies(
         said = f"The photos show {len(rows)} of its points apart from each other."
         return _none(said)
     plain = bool((colors == colors[0]).all())
-    if not plain and len(scene.points) >= LEAST_SHOWN:
-        kept, said = _shown(scene, points[rows], colors[rows], cancelled)
+    if from_photos or (not plain and len(scene.points) >= LEAST_SHOWN):
+        kept, said = _shown(scene, points[rows], colors[rows], cancelled, int(from_photos))
         return Fit(points[rows][kept], colors[rows][kept], len(rows), pixels, said)
     judged = posed.with_loose_points(
         replace(
@@ -149,19 +157,57 @@ def _none(sentence: str, alignment: Alignment | None = None) -> Fit:
 
 
 def _shown(
-    scene: Scene, points: Float, colors: Colors, cancelled: Callable[[], bool]
+    scene: Scene, points: Float, colors: Colors, cancelled: Callable[[], bool], own: int = 0
 ) -> tuple[npt.NDArray[np.bool_], str]:
-    """Which points [n,3] photos show in their colours; none, unless they do so about as often as the scene's own."""
+    """Which points [n,3] photos show in their colours; none, unless they do so about as often as the scene's own, or
+    where it has none, more often than by chance.
+
+    own: number of photos that each colour is from, which do not count.
+    """
     views = [view for view in scene.views if view.split != "test"]
     evidence = posed.evidence_of(points, colors, views, cancelled)
+    shown, agreeing = (np.maximum(counts - own, 0) for counts in (evidence.shown, evidence.agreeing))
+    agreement = float(agreeing.sum() / max(1, shown.sum()))
+    said = (
+        f"{'The other photos' if own else 'The photos'} show their colours at {100 * agreement:.0f} % of the places, "
+        f"exchanged colours at {100 * evidence.chance:.0f} %"
+    )
+    if len(scene.points) < LEAST_SHOWN:
+        fits = not posed.by_chance(agreement, evidence.chance)
+        return (agreeing > 0) & evidence.inside & fits, f"{said}."
     reference = posed.evidence_of(*_some(scene), views, cancelled)
-    above_chance = evidence.agreement - evidence.chance
+    above_chance = agreement - evidence.chance
     fits = above_chance > LEAST_SHARE * max(0.0, reference.agreement - reference.chance)
-    return (evidence.agreeing > 0) & evidence.inside & fits, (
-        f"The photos show their colours at {100 * evidence.agreement:.0f} % of the places, exchanged colours at "
-        f"{100 * evidence.chance:.0f} %; those of the points of the photos, at {100 * reference.agreement:.0f} % "
+    return (agreeing > 0) & evidence.inside & fits, (
+        f"{said}; those of the points of the photos, at {100 * reference.agreement:.0f} % "
         f"and {100 * reference.chance:.0f} %."
     )
+
+
+def joined(scene: Scene, fit: Fit) -> Scene:
+    """The scene with the points that are used behind its own."""
+    return replace(
+        scene,
+        points=np.concatenate([scene.points, fit.points]),
+        colors=np.concatenate([scene.colors, fit.colors]),
+        **_tracks(scene, fit),
+    )
+
+
+def _tracks(scene: Scene, fit: Fit) -> dict[str, Any]:
+    """The tracks of the scene's points and of those of the scan after them; none where the scene's are not known, since
+    those of the scan alone would mean that no photo shows the others."""
+    if scene.point_views is None:
+        return {"point_views": None, "point_errors": None, "track_lengths": None}
+    added = point_views(scene, fit.points)
+    offsets, views = scene.point_views
+    offsets = np.concatenate([offsets, offsets[-1] + added.offsets[1:]])
+    errors = scene.point_errors
+    return {
+        "point_views": PointViews(offsets, np.concatenate([views, added.views])),
+        "point_errors": None if errors is None else np.append(errors, np.full(len(fit.points), np.nan)),
+        "track_lengths": np.diff(offsets).astype(np.int32),
+    }
 
 
 def most(views: Sequence[View], side: int | None) -> int:

@@ -68,6 +68,11 @@ class Accepted(Response):
         default_factory=list,
         description="Those of `other_folders` of which no use is made where photos lie beside them.",
     )
+    depth_folders: list[str] = Field(
+        default_factory=list,
+        description="Those of `other_folders` whose pictures are uploaded as poses: depths of the photos, and how "
+        "sure they are.",
+    )
     output_marks: list[str] = Field(
         default_factory=list,
         description="Names of files of which a folder with results of Splatmill holds two at least.",

@@ -4,7 +4,7 @@ from splatmill_worker.sfm.posed.camera_models import UnreadModel
 from splatmill_worker.sfm.posed.capture import PosedInput, find, without_cameras
 from splatmill_worker.sfm.posed.judged.evidence import evidence_of
 from splatmill_worker.sfm.posed.judged.footprints import footprints, resolved
-from splatmill_worker.sfm.posed.judged.points import MOST_LOOSE, with_loose_points, with_points
+from splatmill_worker.sfm.posed.judged.points import MOST_LOOSE, by_chance, with_loose_points, with_points
 from splatmill_worker.sfm.posed.judged.uncolored import seen_in
 from splatmill_worker.sfm.posed.judged.visible import visible
 from splatmill_worker.sfm.posed.programs import TwoFiles
@@ -14,6 +14,7 @@ __all__ = [
     "PosedInput",
     "TwoFiles",
     "UnreadModel",
+    "by_chance",
     "evidence_of",
     "find",
     "footprints",

@@ -13,6 +13,9 @@ from typing import Any
 INTRINSICS = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy", "w": "width", "h": "height"}
 """The names of the intrinsics in a transforms document, and in Polycam's files. These have no distortion."""
 
+DEPTH_UNIT = 1e-3
+"""Metres of a level of the maps in keyframes/depth, whose photos have the same names."""
+
 ROWS = (2, 0, 1)
 """The row of Polycam's matrix that each of x, y and z is."""
 
@@ -22,7 +25,10 @@ def document(paths: Sequence[Path], parsed: Callable[[Path], Any]) -> dict[str, 
 
     parsed: reads a JSON file. Raises what it raises.
     """
-    return {"frames": [_frame(path, parsed(path)) for path in paths]}
+    return {
+        "depth_unit_scale_factor": DEPTH_UNIT,
+        "frames": [_frame(path, parsed(path)) for path in paths],
+    }
 
 
 def photo_folder(cameras: Path) -> str:

@@ -70,10 +70,12 @@ def load(
     messages = list(notes)
     warnings: list[str] = []
     points = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+    unit: float | None = None
     for path, document, said in _documents(paths, files):
         warnings += said
         if path.is_dir():
             polycam.check_photos(path, files.photos)
+        unit = _depth_unit(document) or unit
         part = parts.of_file(path)
         if part == "val":
             for frame in document["frames"]:
@@ -164,6 +166,7 @@ def load(
         left_out=tuple(left_out),
         notes=tuple(messages),
         warnings=(*warnings, *copy_warnings),
+        depth_unit=unit,
     )
 
 
@@ -270,7 +273,19 @@ def _view(
     view, *other = [
         fit_to_file(camera_and_lens(camera, viewmat), relative, photo, mask) for camera in cameras
     ]
+    if isinstance(frame.get("depth_file_path"), str):
+        view = replace(view, depth=_file(path.parent, frame["depth_file_path"], capture))
     return name, replace(view, other=other[0]) if other else view
+
+
+def _depth_unit(document: dict[str, Any]) -> float | None:
+    """Length in the world of one level of the depth maps of a document; None where it names none."""
+    with suppress(ValueError):
+        unit = _number(document, "depth_unit_scale_factor")
+        if unit is not None and math.isfinite(unit) and unit > 0.0:
+            return unit
+    named = any(isinstance(frame, dict) and frame.get("depth_file_path") for frame in document["frames"])
+    return polycam.DEPTH_UNIT if named else None
 
 
 def _named_mask(path: Path, name: str, files: ImageFiles, capture: Path) -> Path | None:

@@ -12,6 +12,7 @@ const STAGES = new Map(Object.entries({
   mapping: "Placing cameras",
   stereo: "Adding points by stereo",
   alignment: "Placing the scan",
+  depth: "Reading the depth maps",
   training: "Training",
   evaluation: "Comparing photos with the scene",
 }));

@@ -17,6 +17,7 @@ import { hasPhotosBeside, named } from "./documents.js";
  * @property {string[]} mask_beginnings
  * @property {Record<string, string[]>} other_folders names in lower case of folders without photos, by what they hold
  * @property {string[]} unused_folders those of them that are not used beside photos
+ * @property {string[]} depth_folders those of them with depths of the photos, which go along as poses
  * @property {string[]} output_marks
  * @property {string[]} output_media
  * @property {{what: string, suffixes: string[], advice: string}[]} unread
@@ -76,12 +77,13 @@ export function suffix(path) {
 }
 
 /**
- * Whether a file of a capture may hold cameras that are read. One that a training starts from lies among them, too.
+ * Whether a file of a capture may hold cameras that are read. One that a training starts from, and depth maps, lie among
+ * them, too.
  * @param {{role: string | null, name: string}} file
  * @param {Accepted} accepted
  */
 export function holdsCameras(file, accepted) {
-  if (file.role !== "poses" || [".ply", ...accepted.points].includes(suffix(file.name))) return false;
+  if (file.role !== "poses" || [".ply", ...accepted.points, ...accepted.photos].includes(suffix(file.name))) return false;
   return !Object.values(accepted.other_cameras).flat().some((pattern) => fits(file.name, pattern));
 }
 
@@ -115,17 +117,19 @@ export function sort(paths, accepted, documents = new Map(), lists = new Map()) 
   const poses = namesOf(cameras, visible);
   const points = named(read, "ply_file_path", cameras.top);
   for (const path of visible) if (points.has(path) && suffix(path) === ".ply") poses.set(path, path.slice(cameras.top.length));
+  const maps = mapsIn(pictures, visible, read, cameras.top, accepted);
+  const taken = pictures.some((path) => !maps.has(path));
   const alone = poses.size === 0;
   const programs = programFiles(visible, accepted);
   const unread = visible.filter((path) => Object.values(accepted.other_cameras).flat().some((pattern) => fits(path, pattern)));
   const small = unread.filter((path) => !accepted.large_cameras.some((pattern) => fits(path, pattern)));
-  if (pictures.length) for (const path of [...programs, ...small]) if (!poses.has(path)) poses.set(path, path);
-  const zips = pictures.length ? camerasInZips(visible, lists, accepted) : [];
+  if (taken) for (const path of [...programs, ...small]) if (!poses.has(path)) poses.set(path, path);
+  const zips = taken ? camerasInZips(visible, lists, accepted) : [];
   const along = new Set(alone ? zips.filter(({ posed }) => posed).map(({ path }) => path) : []);
   /** @type {Sorted} */
-  const sorted = { files: [], ignored: [], problem: cameras.problem, named: new Set([...drawn].filter((path) => masks.has(path))), others: new Map(), outputs: [], top: cameras.top, zipped: zips.filter(({ path }) => !along.has(path)), posed: !alone || (pictures.length > 0 && programs.length > 0), idle: pictures.length ? [] : programs };
+  const sorted = { files: [], ignored: [], problem: cameras.problem, named: new Set([...drawn].filter((path) => masks.has(path))), others: new Map(), outputs: [], top: cameras.top, zipped: zips.filter(({ path }) => !along.has(path)), posed: !alone || (taken && programs.length > 0), idle: taken ? [] : programs };
   if (alone) {
-    const inside = visible.filter((path) => path.startsWith(photoRoot) && isPhoto(path));
+    const inside = visible.filter((path) => path.startsWith(photoRoot) && isPhoto(path) && !maps.has(path));
     sorted.problem ??= noPhotos(inside, accepted);
     sorted.others = besidePhotos(inside, accepted);
   }
@@ -134,6 +138,7 @@ export function sort(paths, accepted, documents = new Map(), lists = new Map()) 
     const mask = masks.get(path);
     if (pose !== undefined) sorted.files.push({ role: "poses", name: pose, path });
     else if (mask !== undefined) sorted.files.push({ role: "masks", name: mask, path });
+    else if (maps.has(path)) sorted.files.push({ role: "poses", name: path.slice(path.startsWith(top) ? top.length : 0), path });
     else if (path.startsWith(photoRoot) && isPhoto(path) && !sorted.others.has(path)) {
       sorted.files.push({ role: "images", name: path.slice(photoRoot.length), path });
     } else if (along.has(path)) sorted.files.push({ role: "images", name: path, path });
@@ -226,6 +231,24 @@ function masksIn(pictures, top, photoRoot, accepted) {
   }
   for (const [path, name] of masks) masks.set(path, name.slice((name.startsWith(photoRoot) ? photoRoot : top).length));
   return masks;
+}
+
+/**
+ * The depth maps and maps of confidence beside photos or a video.
+ * @param {string[]} pictures
+ * @param {string[]} paths
+ * @param {Record<string, unknown>[]} read documents of the data set
+ * @param {string} top
+ * @param {Accepted} accepted
+ */
+function mapsIn(pictures, paths, read, top, accepted) {
+  const drawn = named(read, "depth_file_path", top);
+  const photos = named(read, "file_path", top);
+  const kind = (/** @type {string} */ path) => kindOfFolder(path.startsWith(top) ? path.slice(top.length) : path, accepted);
+  const maps = new Set(pictures.filter((path) => (accepted.depth_folders.includes(kind(path) ?? "") || drawn.has(path)) && !photos.has(path)));
+  const others = [...accepted.unused_folders, ...accepted.depth_folders, "masks"];
+  const beside = pictures.some((path) => !maps.has(path) && !others.includes(kind(path) ?? ""));
+  return beside || paths.some((path) => accepted.videos.includes(suffix(path))) ? maps : new Set();
 }
 
 /** A path without its suffix. @param {string} path */

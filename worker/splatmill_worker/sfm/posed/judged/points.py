@@ -141,10 +141,10 @@ def with_loose_points(scene: Scene, cancelled: Callable[[], bool]) -> Scene:
 
 def _elsewhere(evidence: Evidence) -> bool:
     unseen = float((evidence.shown == 0).mean())
-    return unseen > 0.5 or _by_chance(evidence.agreement, evidence.chance)
+    return unseen > 0.5 or by_chance(evidence.agreement, evidence.chance)
 
 
-def _by_chance(agreement: float, chance: float) -> bool:
+def by_chance(agreement: float, chance: float) -> bool:
     """Whether photos show the colours of points hardly more often than exchanged ones."""
     return not (agreement >= PLAIN or agreement > ABOVE_CHANCE * chance)
 
@@ -156,14 +156,14 @@ def _shows_others(scene: Scene, cancelled: Callable[[], bool]) -> bool:
         return False
     owners = np.repeat(np.arange(len(scene.points)), np.diff(scene.point_views.offsets))
     used = [index for index, view in enumerate(scene.views) if view.split != "test"]
-    shown, agreeing, by_chance = 0, 0, 0
+    shown, agreeing, exchanged = 0, 0, 0
     for index in used[:: -(-len(used) // CHECKED)]:
         rows = owners[scene.point_views.views == index]
         evidence = evidence_of(scene.points[rows], scene.colors[rows], [scene.views[index]], cancelled)
         shown += int(evidence.shown.sum())
         agreeing += int(evidence.agreeing.sum())
-        by_chance += int(evidence.by_chance.sum())
-    return _by_chance(agreeing / max(1, shown), by_chance / max(1, shown))
+        exchanged += int(evidence.by_chance.sum())
+    return by_chance(agreeing / max(1, shown), exchanged / max(1, shown))
 
 
 def _loose_note(given: int, judged: int, kept: int, evidence: Evidence, plain: bool) -> str:
