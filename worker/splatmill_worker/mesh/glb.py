@@ -1,7 +1,7 @@
 """Meshes as `.glb`: one primitive of triangles, with a texture or a colour at each vertex, which programs show unlit.
 
 The light of the photos is in the colours already, hence KHR_materials_unlit. glTF has y up: the mesh is turned about x
-by 180 degrees, as the `.glb` of its model is.
+by 180 degrees, as the `.glb` of its model is, and its node further where -y is not up in the world of the cameras.
 """
 
 from __future__ import annotations
@@ -26,8 +26,12 @@ QUALITY = 92
 """JPEG quality of a texture."""
 
 
-def write(path: Path, mesh: Mesh, offset: tuple[float, float, float]) -> None:
-    """Write a mesh. offset: world = mesh + offset, in the `extras` of the primitive where it is not 0."""
+def write(path: Path, mesh: Mesh, offset: tuple[float, float, float], up: gltf.Up | None = None) -> None:
+    """Write a mesh.
+
+    offset: world = mesh + offset, in the `extras` of the primitive where it is not 0.
+    up: of the mesh, as of `gltf.node`.
+    """
     parts = gltf.Parts()
     attributes = {"POSITION": parts.add(mesh.vertices * np.array([1, -1, -1], np.float32), bounds=True)}
     if mesh.colors is not None:
@@ -58,7 +62,7 @@ def write(path: Path, mesh: Mesh, offset: tuple[float, float, float]) -> None:
         "extensionsUsed": [UNLIT],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
+        "nodes": [gltf.node(up)],
         "meshes": [{"primitives": [primitive]}],
         "materials": [{"pbrMetallicRoughness": surface, "doubleSided": True, "extensions": {UNLIT: {}}}],
     }

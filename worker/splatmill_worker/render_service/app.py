@@ -291,7 +291,9 @@ class RenderApp:
         )
         folder = scratch(request)
         path, back, record = await self._queue.run(
-            partial(conversion.convert, model, form, folder), request.is_disconnected, _client(request)
+            partial(conversion.convert, model, form, folder, self._storage),
+            request.is_disconnected,
+            _client(request),
         )
         views, what = await run_in_threadpool(conversion.pictures_of, self._storage, model_id)
         behind = await run_in_threadpool(conversion.background_of, self._storage, model_id)

@@ -40,13 +40,20 @@ class PictureScore:
     before: float | None
 
 
-def convert(model: LoadedModel, form: ModelFormat, folder: Path) -> tuple[Path, Gaussians, Conversion]:
-    """Write the model to a file in `folder`; return it, what is read back from it, and the record of the conversion."""
+def convert(
+    model: LoadedModel, form: ModelFormat, folder: Path, storage: Storage | None = None
+) -> tuple[Path, Gaussians, Conversion]:
+    """Write the model to a file in `folder`; return it, what is read back from it, and the record of the conversion.
+
+    storage: where its cameras are, which say what is up; None: that is not asked for.
+    """
+    from splatmill_worker.render_service.world_up import up_of
     from splatmill_worker.splat.formats import registry
 
     began = time.perf_counter()
     path = folder / f"model{form.suffix}"
-    count = registry.write(path, model.gaussians, offset=model.offset, antialiased=model.antialias)
+    up = None if storage is None else up_of(_cameras_of(storage, model.id))
+    count = registry.write(path, model.gaussians, offset=model.offset, antialiased=model.antialias, up=up)
     seconds = time.perf_counter() - began
     back = registry.read(path).gaussians if form.readable else model.gaussians
     if model.backend == "gpu":
@@ -57,14 +64,20 @@ def convert(model: LoadedModel, form: ModelFormat, folder: Path) -> tuple[Path, 
 
 def pictures_of(storage: Storage, model_id: str) -> tuple[list[ModelCamera], ComparedWith | None]:
     """The cameras to compare from, and what with: held-out photos, renderings where there are none, or nothing."""
-    try:
-        stored = ModelCameras.model_validate_json(storage.get(layout.model_file(model_id, "cameras.json")))
-    except (FileNotFoundError, ValueError):
+    stored = _cameras_of(storage, model_id)
+    if stored is None:
         return [], None
     photos = [camera for camera in stored.cameras if camera.photo is not None]
     if photos:
         return _evenly(photos), ComparedWith.held_out
     return _evenly(stored.cameras), ComparedWith.renderings if stored.cameras else None
+
+
+def _cameras_of(storage: Storage, model_id: str) -> ModelCameras | None:
+    try:
+        return ModelCameras.model_validate_json(storage.get(layout.model_file(model_id, "cameras.json")))
+    except (FileNotFoundError, ValueError):
+        return None
 
 
 def background_of(storage: Storage, model_id: str) -> float:

@@ -15,6 +15,7 @@ from splatmill_worker.errors import ModelUnreadable
 from splatmill_worker.render_service.encoding import camera_of
 from splatmill_worker.render_service.local import REFUSED, STOPPED, UNWRITABLE, read
 from splatmill_worker.render_service.loss import Loss, Viewpoint, look, loss
+from splatmill_worker.render_service.world_up import up_beside
 from splatmill_worker.splat.formats import registry
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.orbit import orbit_cameras
@@ -74,7 +75,9 @@ def convert(model: Path, outs: Sequence[Path], photos: Path | None) -> tuple[int
     seen, notes = look(gaussians, viewpoints, antialias=antialias)
     converted = []
     for out in outs:
-        count = registry.write(out, gaussians, offset=contents.offset, antialiased=antialias)
+        count = registry.write(
+            out, gaussians, offset=contents.offset, antialiased=antialias, up=up_beside(model)
+        )
         lost = None
         found = format_of(out.name)
         if found is not None and found.readable:

@@ -26,8 +26,10 @@ from splatmill_worker.mesh.poisson import TooFine
 from splatmill_worker.mesh.triangles import Mesh
 from splatmill_worker.render_service.encoding import camera_of
 from splatmill_worker.render_service.local import AXES, REFUSED, STOPPED, UNWRITABLE, read
+from splatmill_worker.render_service.world_up import up_of
 from splatmill_worker.sandbox import FIRST_TO_DIE
 from splatmill_worker.scene import Camera
+from splatmill_worker.splat.formats.gltf import Up
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.orbit import DEFAULT_FOV, UP, Float, cameras_along, path_of
 
@@ -111,7 +113,9 @@ def mesh_file(
         ) from error
     except TooFine as error:
         raise Refusal("option_out_of_range", f"{error} Choose larger voxels or a smaller box.") from error
-    write(out, built.mesh, contents.offset)
+    set_up = stored is None or len(stored.cameras) < 2
+    x, y, z = (float(value) for value in AXES[up])
+    write(out, built.mesh, contents.offset, (x, y, z) if set_up else up_of(stored))
     return built
 
 
@@ -130,10 +134,10 @@ def cameras_for(stored: ModelCameras | None, gaussians: Gaussians, up: Float = U
     return list(_rings(gaussians, up))
 
 
-def write(out: Path, mesh: Mesh, offset: tuple[float, float, float]) -> None:
-    """Write a mesh in the format of the suffix. offset: world = model + offset."""
+def write(out: Path, mesh: Mesh, offset: tuple[float, float, float], up: Up | None = None) -> None:
+    """Write a mesh in the format of the suffix. offset: world = model + offset. up: by which a `.glb` is upright."""
     if out.suffix.lower() == ".glb":
-        glb.write(out, mesh, offset)
+        glb.write(out, mesh, offset, up)
         return
     comments = ["Made by Splatmill"]
     if any(offset):

@@ -41,12 +41,20 @@ _POINTS = 0
 Array = npt.NDArray[np.generic]
 
 
-def write(path: Path, gaussians: Gaussians, *, offset: Offset = NO_OFFSET, antialiased: bool = False) -> int:
+def write(
+    path: Path,
+    gaussians: Gaussians,
+    *,
+    offset: Offset = NO_OFFSET,
+    antialiased: bool = False,
+    up: gltf.Up | None = None,
+) -> int:
     """Write `gaussians` as a `.glb` in the frame of glTF (y up); returns how many were written.
 
     Rows with a non-finite parameter and rows with an opacity under MIN_OPACITY are left out. The colours of degree 0
     are stored a second time, as COLOR_0, for programs that show points only. offset, antialiased: of `Contents`, in the
-    `extras` of the primitive. The file is replaced atomically and synced. Raises ValueError for 4 GiB or more.
+    `extras` of the primitive. up: as of `gltf.node`. The file is replaced atomically and synced. Raises ValueError for
+    4 GiB or more.
     """
     turned = turned_about_x(visible(gaussians))
     parts = gltf.Parts()
@@ -78,13 +86,15 @@ def write(path: Path, gaussians: Gaussians, *, offset: Offset = NO_OFFSET, antia
         "scenes": [{"nodes": [0] if turned.count else []}],
     }
     if turned.count:  # glTF has no accessors of nothing
-        document |= {"nodes": [{"mesh": 0}], "meshes": [{"primitives": [primitive]}]} | parts.document()
+        document |= {"nodes": [gltf.node(up)], "meshes": [{"primitives": [primitive]}]} | parts.document()
     gltf.write(path, document, parts if turned.count else None, f"{turned.count} Gaussians")
     return turned.count
 
 
 def read(path: Path) -> Contents:
     """Read the Gaussians of a `.glb`: one primitive of points, float or quantised, whose node leaves it in place.
+
+    A rotation by which Splatmill has set it upright is not applied: the model keeps the frame of its cameras.
 
     Raises ModelUnreadable for any other file, and FileNotFoundError where there is none.
     """
@@ -254,5 +264,6 @@ def _check_node(document: dict[str, Any], mesh: int) -> None:
     holders = [node for node in nodes if node.get("mesh") == mesh]
     if len(holders) != 1 or any(node.get("children") for node in nodes):
         raise ValueError("its Gaussians are not in one node without a parent")
-    if {"translation", "rotation", "scale", "matrix"} & holders[0].keys():
+    moves = {"translation", "rotation", "scale", "matrix"} & holders[0].keys()
+    if moves and not (moves == {"rotation"} and holders[0].get("extras") == gltf.UPRIGHT):
         raise ValueError("its node moves, turns or scales the Gaussians, which is not read")

@@ -28,6 +28,12 @@ COMPONENTS: dict[int, tuple[str, float]] = {
 }
 """Component types of attributes: numpy's name, and what a normalized value is divided by."""
 
+Up = tuple[float, float, float]
+"""A unit vector that points up, in the frame of a `.ply`."""
+
+UPRIGHT = {"upright": True}
+"""Extras of a node that is turned for programs to show it upright; what is in it has the frame of its cameras."""
+
 _ATTRIBUTES, _INDICES = 34962, 34963
 _KINDS = {"float32": 5126, "uint8": 5121, "uint16": 5123, "uint32": 5125}
 
@@ -85,6 +91,22 @@ class Parts:
             "bufferViews": self.views,
             "buffers": [{"byteLength": self.length}],
         }
+
+
+def node(up: Up | None) -> dict[str, Any]:
+    """The node of the first mesh, whose vertices are those of a `.ply` turned about x by 180 degrees, so that -y is y.
+
+    up: where that is not what points up, the node turns it to y, by the shortest rotation. None: not known.
+    """
+    if up is None:
+        return {"mesh": 0}
+    x, y, z = up[0], -up[1], -up[2]
+    if y > 1.0 - 1e-9:
+        return {"mesh": 0}
+    # The quaternion (x, y, z, w) from u to y: (u x y, 1 + u . y), of length 1; for u = -y, half a turn about x.
+    turn = np.array([-z, 0.0, x, 1.0 + y]) if y > -1.0 + 1e-9 else np.array([1.0, 0.0, 0.0, 0.0])
+    turn /= np.linalg.norm(turn)
+    return {"mesh": 0, "rotation": [float(value) for value in turn], "extras": UPRIGHT}
 
 
 def write(path: Path, document: dict[str, Any], parts: Parts | None, what: str) -> None:

@@ -9,7 +9,7 @@ from typing import Protocol
 
 from splatmill.schema.files.formats import MODEL_FORMATS, format_of
 from splatmill_worker.errors import ModelUnreadable
-from splatmill_worker.splat.formats import compressed_ply, glb, ksplat, ply, sog, splat, spz
+from splatmill_worker.splat.formats import compressed_ply, glb, gltf, ksplat, ply, sog, splat, spz
 from splatmill_worker.splat.formats.contents import NO_OFFSET, Contents, Offset
 from splatmill_worker.splat.gaussians import Gaussians
 
@@ -87,13 +87,24 @@ def read(path: Path) -> Contents:
     return function(path)
 
 
-def write(path: Path, gaussians: Gaussians, *, offset: Offset = NO_OFFSET, antialiased: bool = False) -> int:
+def write(
+    path: Path,
+    gaussians: Gaussians,
+    *,
+    offset: Offset = NO_OFFSET,
+    antialiased: bool = False,
+    up: gltf.Up | None = None,
+) -> int:
     """Write Gaussians to a file whose suffix names the format, and return how many it holds.
 
     gaussians: in the frame of the standard .ply, of any dtype and on any device.
     offset, antialiased: as in `Contents`, stored where the format has a place for them.
+    up: a unit vector, by which a `.glb` is shown upright; None where it is not known, and -y is taken.
 
     Rows with a non-finite parameter and rows with an opacity under MIN_OPACITY are left out. The file is replaced
     atomically. Raises ModelUnreadable for a suffix that is not written, and OSError.
     """
-    return writer(path)(path, gaussians, offset=offset, antialiased=antialiased)
+    function = writer(path)
+    if function is glb.write:
+        return glb.write(path, gaussians, offset=offset, antialiased=antialiased, up=up)
+    return function(path, gaussians, offset=offset, antialiased=antialiased)

@@ -35,7 +35,7 @@ class Conversion(Response):
 CONVERSION_HEADER = "Splatmill-Conversion"
 """Header of the renderer's response with a converted file: its `Conversion` as JSON."""
 
-CONVERSION_VERSION = 1
+CONVERSION_VERSION = 2
 """To be raised when a converter writes other bytes than before."""
 
 
