@@ -404,7 +404,8 @@ def _maps(
     They lie in folders of such names, or frames name them. What frames name as a photo is none.
     """
     maps = {name for name in pictures if kind_of_folder(name.removeprefix(top)) in MEASURED}
-    maps |= _named(documents, "depth_file_path", top).intersection(pictures)
+    for key in ("depth_file_path", "depth_path"):
+        maps |= _named(documents, key, top).intersection(pictures)
     maps -= _named(documents, "file_path", top)
     media = any(_suffix(name) in VIDEO_SUFFIXES for name in names)
     photos = [name for name in pictures if name not in maps]

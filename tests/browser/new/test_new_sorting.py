@@ -83,7 +83,12 @@ TRANSFORMS = {
         }
     ),
     "depth maps that frames name": json.dumps(
-        {"frames": [{"file_path": "images/a.jpg", "depth_file_path": "sensor/a.png"}]}
+        {
+            "frames": [
+                {"file_path": "images/a.jpg", "depth_file_path": "sensor/a.png"},
+                {"file_path": "images/b.jpg", "depth_path": "sensor/b.png"},
+            ]
+        }
     ),
     "photos that frames name": json.dumps(
         {"frames": [{"file_path": "images/a.jpg"}, {"file_path": "more/b.jpg"}]}
@@ -106,7 +111,8 @@ TREES |= {
 TREES |= {
     "masks that frames name": "set/images/a.jpg set/images/b.jpg set/images/obj_1.png set/sam/obj_0.png "
     "set/sam/other.png set/points.ply set/transforms.json",
-    "depth maps that frames name": "set/images/a.jpg set/sensor/a.png set/depth/b.png set/transforms.json",
+    "depth maps that frames name": "set/images/a.jpg set/images/b.jpg set/sensor/a.png set/sensor/b.png "
+    "set/depth/b.png set/transforms.json",
     "photos that frames name": "images/a.jpg more/b.jpg more/c.jpg transforms.json",
 }
 

@@ -46,6 +46,12 @@ MIN_DETERMINANT = 1e-12
 """Determinant of the rotation part up to which a matrix counts as singular or mirrored."""
 
 
+DEPTHS = "depth_file_path", "depth_path"
+"""The fields of a frame that name its depth map, of nerfstudio and of instant-ngp."""
+
+DEPTH_UNITS = "depth_unit_scale_factor", "integer_depth_scale"
+"""The fields of a document with the length of one of its levels, of the same programs."""
+
 MAX_FILE_BYTES = 32 * 2**20
 """Bytes of a transforms file: 35,000 frames and more."""
 
@@ -273,18 +279,20 @@ def _view(
     view, *other = [
         fit_to_file(camera_and_lens(camera, viewmat), relative, photo, mask) for camera in cameras
     ]
-    if isinstance(frame.get("depth_file_path"), str):
-        view = replace(view, depth=_file(path.parent, frame["depth_file_path"], capture))
+    depth = next((frame[key] for key in DEPTHS if isinstance(frame.get(key), str)), None)
+    if depth is not None:
+        view = replace(view, depth=_file(path.parent, depth, capture))
     return name, replace(view, other=other[0]) if other else view
 
 
 def _depth_unit(document: dict[str, Any]) -> float | None:
     """Length in the world of one level of the depth maps of a document; None where it names none."""
-    with suppress(ValueError):
-        unit = _number(document, "depth_unit_scale_factor")
-        if unit is not None and math.isfinite(unit) and unit > 0.0:
-            return unit
-    named = any(isinstance(frame, dict) and frame.get("depth_file_path") for frame in document["frames"])
+    for key in DEPTH_UNITS:
+        with suppress(ValueError):
+            unit = _number(document, key)
+            if unit is not None and math.isfinite(unit) and unit > 0.0:
+                return unit
+    named = any(isinstance(frame, dict) and frame.get(DEPTHS[0]) for frame in document["frames"])
     return polycam.DEPTH_UNIT if named else None
 
 
@@ -366,7 +374,7 @@ def world_to_camera(matrix: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
 
 def _sizes(values: dict[str, Any], name: str, photo: Path) -> list[tuple[int, int]]:
     """Width and height of the camera of a frame; where w or h is missing those of the file, stored and upright."""
-    width, height = (_number(values, key) for key in ("w", "h"))
+    width, height = (_either(values, *keys) for keys in (("w", "width"), ("h", "height")))
     if width is not None and height is not None:
         if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
             raise ValueError(f"w and h are {width:g} and {height:g} pixels; they must be 1 to {MAX_SIDE}")
@@ -390,6 +398,16 @@ def _number(values: dict[str, Any], key: str, default: float | None = None) -> f
         raise ValueError(f"{key} is {str(value)[:40]!r}, which is no number of usual size") from None
 
 
+def _either(values: dict[str, Any], key: str, other: str) -> float | None:
+    """The number in one of two fields that mean the same. Raises ValueError where both have one and these differ."""
+    given, same = _number(values, key), _number(values, other)
+    if given is not None and same is not None and given != same:
+        raise ValueError(
+            f"{key} is {given:g} and {other} is {same:g}, which mean the same; leave the wrong one out"
+        )
+    return same if given is None else given
+
+
 def _matrix(rows: Any) -> npt.NDArray[np.float64]:
     try:
         return np.array(rows, np.float64)
@@ -404,14 +422,14 @@ def _colmap_camera(values: dict[str, Any], size: tuple[int, int]) -> pycolmap.Ca
     if kind == "panorama":
         return panorama(width, height)
 
-    def focal(length: str, angle: str, side: int) -> float | None:
-        given, seen = _number(values, length), _number(values, angle)
+    def focal(length: str, other: str, angle: str, side: int) -> float | None:
+        given, seen = _either(values, length, other), _number(values, angle)
         return (
             given if given is not None or seen is None else 0.5 * side / math.tan(0.5 * radians(angle, seen))
         )
 
-    horizontal = focal("fl_x", "camera_angle_x", width)
-    vertical = focal("fl_y", "camera_angle_y", height)
+    horizontal = focal("fl_x", "fx", "camera_angle_x", width)
+    vertical = focal("fl_y", "fy", "camera_angle_y", height)
     fx, fy = (horizontal, vertical) if horizontal and vertical else (horizontal or vertical or 0.0,) * 2
     if horizontal is None and vertical is None:
         raise ValueError("it has no focal length; give fl_x or camera_angle_x")

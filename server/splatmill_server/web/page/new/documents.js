@@ -59,7 +59,7 @@ function readings(name) {
 /**
  * The paths that transforms files or their frames name under a key.
  * @param {Iterable<Record<string, unknown>>} documents
- * @param {"file_path" | "mask_path" | "depth_file_path" | "ply_file_path"} key
+ * @param {"file_path" | "mask_path" | "depth_file_path" | "depth_path" | "ply_file_path"} key
  * @param {string} top
  */
 export function named(documents, key, top) {

@@ -242,7 +242,7 @@ function masksIn(pictures, top, photoRoot, accepted) {
  * @param {Accepted} accepted
  */
 function mapsIn(pictures, paths, read, top, accepted) {
-  const drawn = named(read, "depth_file_path", top);
+  const drawn = new Set([...named(read, "depth_file_path", top), ...named(read, "depth_path", top)]);
   const photos = named(read, "file_path", top);
   const kind = (/** @type {string} */ path) => kindOfFolder(path.startsWith(top) ? path.slice(top.length) : path, accepted);
   const maps = new Set(pictures.filter((path) => (accepted.depth_folders.includes(kind(path) ?? "") || drawn.has(path)) && !photos.has(path)));
