@@ -93,15 +93,12 @@ def _photos() -> list[str]:
         never moves in {overlay.MIN_PHOTOS} or more photos is masked
         ([Photographing](photographing.md#copies-near-copies-and-what-never-moves)).
 
-        Photos without EXIF are taken to be of one camera for each folder and each video. Where the motion of the
-        camera
+        Photos without EXIF are taken to be of one camera for each folder and each video. Where the motion of the camera
         does not determine them, pixels are taken to be square, and the focal length to be that of EXIF, or else 1.2
         times the longest side.
 
-        A photo is a panorama if its XMP says so (`GPano:ProjectionType`, equirectangular), or if it is twice as wide
-        as
-        high, its left and right edges meet (up to {panoramas.SEAM:g} times the difference of two columns), and its
-        top
+        A photo is a panorama if its XMP says so (`GPano:ProjectionType`, equirectangular), or if it is twice as wide as
+        high, its left and right edges meet (up to {panoramas.SEAM:g} times the difference of two columns), and its top
         and bottom are of one colour (up to {panoramas.POLES:.0%} of the differences of other rows); a warning says
         where that is assumed. Where only its left and right edges meet, its folder decides, and a warning names both
         readings. Panoramas may lie beside other photos, and are trained as the
@@ -124,26 +121,22 @@ def _photos() -> list[str]:
             [*_codes("primaries", PRIMARIES), *_codes("transfer", TRANSFERS)],
         ),
         f"""Colours are brought to sRGB with 8 bits per channel. A photo is read by its ICC profile, or else by its
-        tags, the chunks sRGB, gAMA and cHRM of PNG, or EXIF (Adobe RGB, other primaries, a power); in a PNG, cICP
-        comes
+        tags, the chunks sRGB, gAMA and cHRM of PNG, or EXIF (Adobe RGB, other primaries, a power); in a PNG, cICP comes
         first. A video is read by its tags. PQ and HLG are converted by one rule, which
         [Photographing](photographing.md#what-can-be-given) has. Photos of 10 or 16 bits are reduced to 8 before that,
         by less than one level: neighbouring tones are then up to
         {PhotoColors(tags=Colors("BT.2020", "PQ")).largest_step()} levels apart for PQ, and up to
-        {PhotoColors(tags=Colors("sRGB", "linear")).largest_step()} in the shadows of linear light, and the report
-        says
+        {PhotoColors(tags=Colors("sRGB", "linear")).largest_step()} in the shadows of linear light, and the report says
         so. Of a photo with a gain map, the SDR picture is used. CMYK and LAB are converted too. Grey
         floating-point numbers are taken as sRGB from 0 to 1, and left out if they reach further; coloured ones are
         refused, since they may be linear light as well. The report says what was converted or assumed.""",
         "### Zips\n",
-        f"""{choices(ARCHIVE_SUFFIXES)} files hold photos or a whole data set. All zips and videos of a capture
-        together
+        f"""{choices(ARCHIVE_SUFFIXES)} files hold photos or a whole data set. All zips and videos of a capture together
         hold up to {archive.MAX_ENTRIES:,} files. A zip in a zip is not unpacked. A zip among photos without cameras
         that holds cameras and no photos gives them theirs; where it has photos too, or other cameras lie beside the
         photos, a sentence names its cameras.
 
-        Names that do not say that they are UTF-8, and are not, are read in the encoding that makes them those which
-        the
+        Names that do not say that they are UTF-8, and are not, are read in the encoding that makes them those which the
         cameras name. Without cameras, it is the first one in which they are words of its language; a warning then has
         another reading too. The order is {choices(zip_names.ENCODINGS)}.""",
         "### Photos, videos and archives that are not read\n",
@@ -162,8 +155,7 @@ def _photos() -> list[str]:
             ],
         ),
         f"""Without cameras, pictures in folders of {", ".join(UNUSED)} are not used where photos lie beside
-        them, and a sentence names them; masks and [depth maps](#depth-maps) are used, and thumbnails compared with
-        the
+        them, and a sentence names them; masks and [depth maps](#depth-maps) are used, and thumbnails compared with the
         photos. If all pictures lie in such folders, or PATH is one, both readings are named and nothing is
         trained. The job fails too, whatever the folder is called, if all pictures are of these kinds by their
         pixels. A picture with a single channel of 16 bits among photos in colour is left out.""",
@@ -198,8 +190,7 @@ def _masks() -> list[str]:
         one hides and the higher one shows, and a warning says so. Masks that hide all of every photo end the job; one
         that hides all of its photo is named. A mask of another shape than its photo is not used. The log
         says how many photos have a mask and what share of their pixels the masks hide. A warning names masks that
-        belong to no photo. Another is given for masks that hide more than {mask_levels.MAX_HIDDEN:.0%} of the pixels
-        of
+        belong to no photo. Another is given for masks that hide more than {mask_levels.MAX_HIDDEN:.0%} of the pixels of
         all photos, which are probably inverted. Where a photo is transparent, it is hidden too.""",
     ]
 
@@ -218,38 +209,29 @@ def _cameras() -> list[str]:
         in it, where N is a number, and what is in brackets may be missing. `images` is needed beside `cameras`,
         both as `.bin` or both as `.txt`; `points3D` may be missing. Of several models, up to
         {colmap_model.MOST_MODELS}, the one with the most of the photos is used, and a warning names the others.
-        Text may have a byte-order mark, any line ends, and names with spaces. Names that are not UTF-8 are read in
-        the
+        Text may have a byte-order mark, any line ends, and names with spaces. Names that are not UTF-8 are read in the
         one of the encodings of zips in which the most of them are photos, and a warning says in which; where two lead
         to different photos, the job fails and names both.
 
-        In `transforms.json`, a frame or the document has {fields}. `camera_angle_x` and `camera_angle_y` may stand
-        for
+        In `transforms.json`, a frame or the document has {fields}. `camera_angle_x` and `camera_angle_y` may stand for
         the focal lengths; a size that is missing is that of the photo. `fx`, `fy`, `width` and `height` mean the same
         as `fl_x`, `fl_y`, `w` and `h`; where both are there and differ, the frame is faulty, and both are named.
         `transform_matrix` is from camera to world, 4 x
         4 or 3 x 4, with OpenGL axes; the fourth row is 0, 0, 0, 1. `mask_path` names the mask of a frame, in any
         folder of the data set; a warning says how many are missing. Where frames name photos beside the folder
-        `images`, those are used too. Of the raw data of Polycam, corrected cameras are preferred, which need the
-        photos
+        `images`, those are used too. Of the raw data of Polycam, corrected cameras are preferred, which need the photos
         in `keyframes/corrected_images`. Tested forms are those of nerfstudio, of instant-ngp, of NeRFCapture and
-        Record3D
-        (each frame with its lens, names without suffix), of Polycam's polyform, and those with `camera_model` PINHOLE
-        and a lens for each frame, which stand for Luma AI, whose export has no public description: all have the
-        cameras
-        of the same COLMAP model, exactly.
+        Record3D (each frame with its lens, names without suffix), of Polycam's polyform, and those with `camera_model`
+        PINHOLE and a lens for each frame, which stand for Luma AI, whose export has no public description: all have
+        the cameras of the same COLMAP model, exactly.
 
         `transforms_train.json`, `transforms_test.json` and `transforms_val.json` are read, beside a `transforms.json`
-        too, and so are the lists `train_filenames`, `test_filenames` and `val_filenames` in a file: those to test
-        with
+        too, and so are the lists `train_filenames`, `test_filenames` and `val_filenames` in a file: those to test with
         are held out, and those of the validation set left out, unless they are also for training. Other files
         `transforms*.json` are read only where there is no `transforms.json`. A photo that is named several times has
-        one camera: where the cameras agree, any of them; where they differ, the photo is left out, and both are
-        named.
-        If those are more than {model_files.MOST_FAULTY:.0%} of the photos, the job fails. Photos of the same bytes
-        with
-        different cameras are left out too, since at most one of the cameras can be right, and a warning names them;
-        if
+        one camera: where the cameras agree, any of them; where they differ, the photo is left out, and both are named.
+        If those are more than {model_files.MOST_FAULTY:.0%} of the photos, the job fails. Photos of the same bytes with
+        different cameras are left out too, since at most one of the cameras can be right, and a warning names them; if
         they are more than {same_bytes.MOST_CONTRADICTED:.0%} of the photos, the job fails. Photos of one colour are
         kept.
 
@@ -259,26 +241,21 @@ def _cameras() -> list[str]:
         camera may be of another size than its photo, with the same shape up to {colmap_model.MAX_ASPECT_ERROR:.0%}.
 
         Cameras of other programs are used where there is neither a COLMAP model nor a `transforms.json`. Their files
-        may lie in any folder, and are recognised by what is in them. Of two files of one program, the one in the
-        outer
-        folder is used; where both lie equally deep, the job fails and names them. Photos are found by the names in
-        the
+        may lie in any folder, and are recognised by what is in them. Of two files of one program, the one in the outer
+        folder is used; where both lie equally deep, the job fails and names them. Photos are found by the names in the
         file, with or without their suffix.
 
         - **Metashape**: File > Export > Export Cameras, as Agisoft XML. Lenses of the types frame and fisheye are
-        read, with f, cx, cy, b1, k1 to k4, p1 and p2; a skew b2 is left out where it moves corners by less than half
-        a
+        read, with f, cx, cy, b1, k1 to k4, p1 and p2; a skew b2 is left out where it moves corners by less than half a
         pixel, and else refused. Of several chunks or components, the one with the most cameras is used. Cameras far
         from the origin, as on the earth, are moved to it. Those of rigs are left out.
 
-        - **RealityScan and RealityCapture**: the CSV of internal and external camera parameters (name, x, y, alt or
-        z,
+        - **RealityScan and RealityCapture**: the CSV of internal and external camera parameters (name, x, y, alt or z,
         heading, pitch, roll, f, px, py, k1 to k4, t1, t2), which Postshot takes too, or an XMP beside each photo. The
         rotation of a CSV is Rz(-heading) Rx(pitch) Ry(roll), from a camera with OpenGL axes to the world. t1 is taken
         as the coefficient of r² + 2x². Of the lenses of an XMP, perspective and brown are read.
 
-        - **OpenSfM and OpenDroneMap**: `reconstruction.json`, with its points; lenses of the types perspective,
-        brown,
+        - **OpenSfM and OpenDroneMap**: `reconstruction.json`, with its points; lenses of the types perspective, brown,
         radial, simple_radial, fisheye and fisheye_opencv. Of several reconstructions, the one with the most photos.
 
         - **Bundler**, as COLMAP, RealityScan, Metashape and others write it too: version 0.3, with its points. The
@@ -295,8 +272,7 @@ def _cameras() -> list[str]:
         read either.
 
         A frame without a matrix is left out with a warning. Up to {model_files.MOST_FAULTY:.0%} of the poses are left
-        out if no camera can have them (mirrored, sheared, not finite); with more, the job fails and names the first.
-        It
+        out if no camera can have them (mirrored, sheared, not finite); with more, the job fails and names the first. It
         fails also if no photo has a camera, or if a file with cameras cannot be read. Quaternions are brought to the
         length 1; one whose length differs from it by more than {MAX_LENGTH_ERROR:.0%} is no rotation.""",
         "### Lenses\n",
@@ -324,10 +300,8 @@ def _points() -> list[str]:
         "## Points\n",
         f"""Points are those of the COLMAP model, or of the `.ply` in the data set that `ply_file_path` in
         `transforms.json` names, whose faces and lists are left out. Points with tracks are used; if the photos
-        that the tracks name do not show their colours, photos are matched to check the cameras. Points without
-        tracks,
-        such as a laser scan (up to {points.MOST_LOOSE:,} of them), are used where photos show their colours; if
-        photos
+        that the tracks name do not show their colours, photos are matched to check the cameras. Points without tracks,
+        such as a laser scan (up to {points.MOST_LOOSE:,} of them), are used where photos show their colours; if photos
         show these hardly more often than by chance, none is used, and the log says so. With fewer than
         {points.LEAST_POINTS}, points are triangulated with the given cameras. A warning says when the cameras explain
         less than {triangulation.CONTRADICTED:.0%} of the matches between photos: then the poses or the intrinsics are
@@ -366,10 +340,9 @@ def _depth() -> list[str]:
         f"""Depth maps of phones and RGB-D cameras beside the photos give points to start from, in addition to those
         above. The map of `images/a.jpg` is `depth/a.png` in one of the folders
         {choices(f"{name}/" for name in OTHER_FOLDERS[DEPTH])}, at any depth, or what a frame of `transforms.json` has
-        as `depth_file_path` (nerfstudio) or `depth_path` (instant-ngp, NeRFCapture). The map of a frame of a video
-        is called by the number of the frame. A map of
-        confidence has the same name in {choices(f"{name}/" for name in OTHER_FOLDERS[CONFIDENCE])}. The page takes
-        them
+        as `depth_file_path` (nerfstudio) or `depth_path` (instant-ngp, NeRFCapture). The map of a frame of a video is
+        called by the number of the frame. A map of
+        confidence has the same name in {choices(f"{name}/" for name in OTHER_FOLDERS[CONFIDENCE])}. The page takes them
         in a folder or a zip, as the command does.
 
         A map is a PNG or TIFF with a single channel of 16 bits, or of 32 as integers or floating-point numbers: the
@@ -378,24 +351,18 @@ def _depth() -> list[str]:
         shape, or of 8 bits or in colours, as maps are that are drawn to be looked at.
 
         Pixels count if their confidence is the highest that occurs in the maps of the capture (2 of 0, 1 and 2, as of
-        Stray Scanner; 255 of 0, 54 and 255, as of Polycam; with more than {given_depth.FEW_LEVELS} levels, from half
-        of
-        the highest), and if they differ from their neighbours by less than {pixels.EDGE:.0%}. Of all maps together,
-        up
+        Stray Scanner; 255 of 0, 54 and 255, as of Polycam; with more than {given_depth.FEW_LEVELS} levels, from half of
+        the highest), and if they differ from their neighbours by less than {pixels.EDGE:.0%}. Of all maps together, up
         to {depth_points.MOST:,} evenly chosen pixels become points, in float64, with the colour of their photo there.
-        They are thinned as a scan is. Those stay whose colour another photo shows; if the other photos do so less
-        than
-        {scan_fit.LEAST_SHARE:.0%} as often, above chance, as for the scene's own points, none is used. Maps of
-        held-out
+        They are thinned as a scan is. Those stay whose colour another photo shows; if the other photos do so less than
+        {scan_fit.LEAST_SHARE:.0%} as often, above chance, as for the scene's own points, none is used. Maps of held-out
         photos and of panoramas are not read.
 
-        The unit of the maps is measured: it is the median ratio of the depths of the scene's own points and the
-        levels
+        The unit of the maps is measured: it is the median ratio of the depths of the scene's own points and the levels
         at them. If half of the ratios differ from it by more than {unit.SPREAD:.0%}, no map is used; a map in which
         they do is left out. A unit that is stated (`depth_unit_scale_factor`, `integer_depth_scale`; a millimetre by
         default where frames name
-        maps, as in nerfstudio, and in Polycam's raw data) is used as it is if it is the same up to {unit.SAME:.0%};
-        if
+        maps, as in nerfstudio, and in Polycam's raw data) is used as it is if it is the same up to {unit.SAME:.0%}; if
         it is not, the measured one is used, and the log has both. With fewer than {unit.FEWEST} such points, a
         stated unit is used, and maps without one are not: a sentence names their distances in {" and in ".join(few)}.
         So maps may be in millimetres, as of Polycam, Stray Scanner, ScanNet and Redwood, or in 1/5000 m, as of TUM
@@ -404,8 +371,7 @@ def _depth() -> list[str]:
         Recovered cameras are treated alike. If nothing else gives a unit to the model, maps with confidence give it
         metres, since phones write millimetres. No depth map ends a job: the report says in a warning why none is
         used, and has the numbers (`depth_maps`, `depth_unit`, `depth_points_used`). Maps beside their photos
-        (`a.depth.png`), in `.npy`, `.pgm` or EXR, and those of TUM RGB-D whose names are other times than those of
-        the
+        (`a.depth.png`), in `.npy`, `.pgm` or EXR, and those of TUM RGB-D whose names are other times than those of the
         photos, are not read.""",
     ]
 
@@ -417,8 +383,7 @@ def _models() -> list[str]:
             ["suffix", "format"],
             [[code(form.suffix), form.name] for form in MODEL_FORMATS.values() if form.readable],
         ),
-        """`splatmill convert`, `render`, `orbit` and `clean` read these, and a training may start from one
-        (`--start`).
+        """`splatmill convert`, `render`, `orbit` and `clean` read these, and a training may start from one (`--start`).
         [Variants of the .ply](formats.md#variants-of-the-ply) has what is read otherwise than it stands in a file, or
         not at all. -y is up in a `.ply`.""",
     ]
