@@ -1,7 +1,7 @@
 """Proves that transforms.json in the forms of several programs has exactly the cameras of the same COLMAP model.
 
 The forms are after the programs' own converters and documentation. Luma AI describes none in public: its form is
-is that of other programs with a lens for each frame. Does not prove what files of their next versions will have.
+that of other programs with a lens for each frame. Does not prove what files of their next versions will have.
 """
 
 import json
