@@ -37,7 +37,7 @@ def textured(mesh: Mesh, views: Sequence[View], side: int) -> Mesh:
     atlas.add_mesh(mesh.vertices, mesh.faces.astype(np.uint32), normals)
     packing = xatlas.PackOptions()
     packing.resolution, packing.padding = side, PADDING
-    atlas.generate(pack_options=packing)
+    atlas.generate(pack_options=packing)  # with the chart options of xatlas (decisions: charts)
     source, faces, uvs = atlas[0]
     scale = side / max(atlas.width, atlas.height)
     width, height = (max(1, round(scale * length)) for length in (atlas.width, atlas.height))
