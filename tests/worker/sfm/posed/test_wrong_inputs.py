@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.support.files.program_files import PROGRAMS, SIZE, record3d
 from tests.support.posed_sets import COUNT, NAMES, frames, loaded, photos, transforms, viewmat
-from tests.support.program_files import PROGRAMS, SIZE, record3d
 
 Change = Callable[[dict[str, Any]], None]
 
