@@ -26,7 +26,8 @@ from splatmill_worker.images.lens import PANORAMA, PINHOLE_MODELS
 from splatmill_worker.images.no_photo import TRAITS
 from splatmill_worker.images.overlays import overlay
 from splatmill_worker.images.panoramas import faces, panoramas
-from splatmill_worker.pipeline import given_depth, scan_fit
+from splatmill_worker.pipeline import scan_fit
+from splatmill_worker.pipeline.depth import given_depth
 from splatmill_worker.readers import scan
 from splatmill_worker.readers.colmap_files import MODELS
 from splatmill_worker.readers.programs.shots import MAX_LENGTH_ERROR

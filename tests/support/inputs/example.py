@@ -16,7 +16,7 @@ from splatmill.transfer.local_capture import find_files
 from splatmill_worker.errors import WorkerError
 from splatmill_worker.images.masks import mask_folder
 from splatmill_worker.images.prepare import names_remark, prepare
-from splatmill_worker.pipeline.given_depth import with_depth
+from splatmill_worker.pipeline.depth.given_depth import with_depth
 from splatmill_worker.scene import Scene, omissions
 from splatmill_worker.sfm import posed
 from splatmill_worker.sfm.posed import zipped

@@ -16,12 +16,12 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from tests.support import depth_sets
 from tests.support.files import unmarked_zip
 from tests.support.files.program_files import PROGRAMS, SIZE, record3d
 from tests.support.inputs.example import Example, Kind
 from tests.support.panoramas import gpano, striped
 from tests.support.posed_sets import COUNT, NAMES, frames, model, photos, transforms, viewmat, zip_of
+from tests.support.scenes import depth_sets
 
 Make = Callable[[Path], object]
 

@@ -14,8 +14,8 @@ from splatmill_worker.mesh.triangles import Mesh
 from splatmill_worker.render_service.convert import convert
 from splatmill_worker.render_service.world_up import up_beside, up_of
 from splatmill_worker.splat.formats import ply, registry
+from tests.support.files.turned import shown
 from tests.support.gaussians import some_gaussians
-from tests.support.turned import shown
 from tests.worker.mesh.test_triangles import chunks
 
 Z_UP = np.eye(3)

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from splatmill.schema import LogEvent
 from splatmill_worker.images.panoramas import faces
 from splatmill_worker.pipeline.capture import posed_scene
+from splatmill_worker.pipeline.depth.given_depth import with_depth
 from splatmill_worker.pipeline.events import progress_events
-from splatmill_worker.pipeline.given_depth import with_depth
 from splatmill_worker.pipeline.holdout.split import honest_split
 from splatmill_worker.pipeline.job import Job
 from splatmill_worker.pipeline.live import LiveCameras, placement_of, store_placement

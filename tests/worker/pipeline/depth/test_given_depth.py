@@ -17,10 +17,10 @@ from PIL import Image
 
 from splatmill.schema import ModelFrame, TrainOptions
 from splatmill_worker.pipeline.capture import posed_scene
-from splatmill_worker.pipeline.given_depth import with_depth
+from splatmill_worker.pipeline.depth.given_depth import with_depth
 from splatmill_worker.pipeline.stages import run
 from splatmill_worker.scene import Camera, Scene, Similarity
-from tests.support import depth_sets
+from tests.support.scenes import depth_sets
 
 pytestmark = pytest.mark.slow
 

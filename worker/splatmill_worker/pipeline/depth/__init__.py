@@ -1,0 +1,1 @@
+"""What depth maps beside the photos give to a training."""
