@@ -18,6 +18,7 @@ from docs.generate import (
     rooms,
     settings,
 )
+from splatmill.files import atomic_write
 
 PAGES = {
     "command-line.md": command_line.page,
@@ -56,4 +57,4 @@ def write_pages(folder: Path, *, ask: bool = True) -> None:
     for path, page in places.items():
         text = page()
         if not path.is_file() or path.read_text() != text:
-            path.write_text(text)
+            atomic_write(path, text)

@@ -103,9 +103,11 @@ def test_the_scene_is_as_good_as_in_one_piece(whole: Path, tmp_path: Path) -> No
 
 
 def test_a_tile_goes_on_where_the_coarse_model_stopped(whole: Path) -> None:
-    coarse = coarse_model.read(PlanFolder.open(whole).ended()["coarse"].path)
+    path = PlanFolder.open(whole).ended()["coarse"].path
+    assert path is not None
+    coarse = coarse_model.read(path)
     plan = tile_plan(coarse, free=500, photos=9)
-    assert coarse.steps == OPTIONS.steps / 2
+    assert coarse.steps == 100
     assert plan.schedule.earlier_visits == coarse.steps / len(coarse.viewmats)
     assert plan.schedule.reduced_until == 0
     assert plan.max_gaussians == pytest.approx(3000 * 500 / coarse.gaussians.count, abs=1)
