@@ -18,6 +18,7 @@ from docs.generate import (
     rooms,
     settings,
 )
+
 from splatmill.files import atomic_write
 
 PAGES = {
