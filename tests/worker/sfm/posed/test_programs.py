@@ -144,8 +144,10 @@ WRONG = {
     "another projection": ("OpenSfM", '"brown"', '"spherical"', "the projection type"),
     "no camera": ("OpenSfM", '{"v2 a": {', '{"v2 b": {', "which is missing"),
     "another version": ("Bundler", "v0.3", "v0.4", "version 0.3 is read"),
+    "f in parts of the photo": ("Bundler", "530.0 ", "0.83 ", "intrinsics are in pixels"),
     "no number": ("Bundler", "530.0 ", "5e400 ", "not finite"),
     "a calibration": ("VisualSFM", "NVM_V3 ", "NVM_V3 FixedK 9 4 9 3", "one calibration of all photos"),
+    "f in millimetres, as of a lens": ("VisualSFM", "\t530.0 ", "\t4.2 ", "intrinsics are in pixels"),
     "a negative focal length": ("VisualSFM", "\t530.0 ", "\t-530.0 ", "its focal length is -530"),
 }
 
@@ -168,6 +170,16 @@ def test_other_distortion_models_of_realityscan_are_refused(tmp_path: Path) -> N
     found = posed.find(tmp_path)
     assert found is not None
     with pytest.raises(ValueError, match="the distortion model is division"):
+        found.load()
+
+
+def test_focal_lengths_of_realityscan_in_pixels_are_refused(tmp_path: Path) -> None:
+    capture(tmp_path, "RealityScan, XMP")
+    for path in tmp_path.glob("*.xmp"):
+        replaced(path, 'FocalLength35mm="29.0"', 'FocalLength35mm="2900.0"')
+    found = posed.find(tmp_path)
+    assert found is not None
+    with pytest.raises(ValueError, match="if it is in pixels"):
         found.load()
 
 
