@@ -113,7 +113,8 @@ def in_tiles(plan: PlanFolder, units: dict[str, dict[str, float]]) -> Row:
     gain = {part: (seams.get(part) or 0) - (seams.get(f"coarse_{part}") or 0) for part in ("seams", "others")}
     longest = max(units[name]["cpu"] for name in trained)
     return {
-        **{name: scene[name] for name in ("psnr", "ssim", "gaussians", "steps")},
+        **{name: scene[name] for name in ("psnr", "ssim", "gaussians")},
+        "trained_steps": scene["steps"],
         "coarse_psnr": facts["coarse"]["psnr"],
         "cpu": round(sum(use["cpu"] for name, use in units.items() if name != "cameras"), 1),
         "chain": round(units["coarse"]["cpu"] + longest + units["scene"]["cpu"], 1),
