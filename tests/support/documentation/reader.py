@@ -37,6 +37,7 @@ SMALLER = (
     (r"\bimage_size=\d+", "image_size=120"),
     (r"\bin range\(100\)", "in range(20)"),
     (r"\bin range\(1, 101\)", "in range(1, 21)"),
+    (r"^(splatmill plan .*)--tiles \d+", r"\1--tiles 2 --steps 20 --image-size 120 --sfm-effort high"),
     # A command without a budget gets one, so that it ends.
     (r"(splatmill train (?!.*(?:--time-budget|--steps|--help)).+)", r"\1 --time-budget 1s --sfm-effort high"),
     # `make demo` writes into this folder instead of the repository's, without a video, from photos that are there.

@@ -77,6 +77,7 @@ NAMED: dict[str, dict[str, Forced]] = {
         "schedule.annealing", of_time=Annealing(boost=None), of_steps=Annealing(boost=4.0, beta2=0.96)
     ),
     "schedule.dropout": _by_plan("schedule.dropout", some=0.2, none=0.0),
+    "schedule.earlier_visits": _by_plan("schedule.earlier_visits", some=150.0, none=0.0),
     "schedule.ends_at": _by_plan("schedule.ends_at", early=STEPS - 2, never=None),
 }
 """Decisions whose levels do not follow from their type. The dropout of a schedule begins after MANY_VISITS."""
