@@ -77,8 +77,9 @@ def compared(scene: str, folder: Path, options: argparse.Namespace) -> Iterator[
     for tiles in options.tiles:
         root = folder / f"tiles-{tiles}"
         root.mkdir()
-        (root / "capture").symlink_to(folder / "capture")
         plan = PlanFolder(root, ScenePlan(digest, asked, tiles))
+        plan.capture.parent.mkdir()
+        plan.capture.symlink_to(folder / "capture")
         plan.save()
         if cameras is not None:
             shutil.copytree(cameras, root / "units" / cameras.name)

@@ -82,7 +82,10 @@ def main(argv: list[str] | None = None) -> int:
     fit_image.add_argument("--out", type=Path, required=True, help="folder for the results")
     fit_image.add_argument("--options", default="{}", help="FitImageOptions as JSON")
     plan = programs.add_parser("plan", help="make a plan of a scene in tiles")
-    plan.add_argument("folder", type=Path, help="folder of the plan, with the photos in capture/")
+    plan.add_argument("folder", type=Path, help="folder of the plan")
+    plan.add_argument(
+        "--capture", type=Path, required=True, help="folder of the photos, which is moved there"
+    )
     plan.add_argument("--options", default="{}", help="TrainOptions as JSON")
     plan.add_argument("--tiles", type=int, required=True)
     unit = programs.add_parser("unit", help="do one unit of a plan, or all that are left")
@@ -147,7 +150,7 @@ def main(argv: list[str] | None = None) -> int:
             from splatmill_worker.tiles import command
 
         if chosen.program == "plan":
-            return command.make_plan(chosen.folder, chosen.options, chosen.tiles)
+            return command.make_plan(chosen.folder, chosen.capture, chosen.options, chosen.tiles)
         if chosen.program == "unit":
             return command.do_unit(chosen.folder, chosen.name)
         return command.list_units(chosen.folder, as_json=chosen.json)

@@ -83,7 +83,7 @@ def test_a_claim_of_a_killed_process_of_this_machine_is_free_at_once(shared: Pla
 def test_a_claim_of_another_machine_holds_while_it_is_renewed(shared: PlanFolder) -> None:
     (shared.root / "units").mkdir()
     claim = shared.root / "units" / f"cameras-{shared.plan.key('cameras', {})}.claim"
-    claim.write_text(json.dumps({"token": "t", "host": "elsewhere", "namespace": "", "pid": 1, "started": 0}))
+    claim.write_text(json.dumps({"token": "t", "host": "elsewhere", "machine": "m", "pid": 1, "started": 0}))
     with pytest.raises(Claimed):
         do(shared, "cameras")
     assert shared.running("cameras") == "elsewhere, process 1"
@@ -102,9 +102,33 @@ def test_a_frozen_process_loses_its_unit_and_changes_nothing_afterwards(shared: 
             other.out.mkdir()
             (other.out / "file").write_text("other")
             other.publish({"seconds": 1.0})
+        assert not frozen.owned()
+        frozen.fail("It came late.", "")
+        with pytest.raises(OSError, match="work"):
+            frozen.publish({})
     path = shared.ended()["cameras"].path
     assert path is not None
     assert (path / "file").read_text() == "other"
+    assert not list(path.parent.glob("*.failed.json"))
+
+
+def test_of_two_that_find_a_stale_claim_one_gets_the_unit(shared: PlanFolder) -> None:
+    """The second judged the claim stale before the first took it: what it then moves aside is the first one's."""
+    with shared.claimed("cameras") as first:
+        claim = claim_of(shared)
+        taken = claim.read_text()
+        claim.write_text(json.dumps({"token": "gone"}))
+
+        class Slow(PlanFolder):
+            def _age(self, claim: Path) -> float:
+                claim.write_text(taken)
+                return CLAIM_SECONDS + 1.0
+
+        with pytest.raises(Claimed), Slow(shared.root, shared.plan).claimed("cameras"):
+            pass
+        assert first.owned()
+        assert first.work.is_dir()
+        assert claim.read_text() == taken
 
 
 def test_a_process_notices_that_its_unit_is_anothers(shared: PlanFolder) -> None:
@@ -143,7 +167,7 @@ def test_a_failure_is_kept_until_it_is_forgotten(shared: PlanFolder) -> None:
     assert shared.plan.ready(shared.states()) == ["scene"]
     do(shared, "scene", "partial")
     partial = shared.ended()["scene"].path
-    shared.forget_failure("tile-1")
+    shared.forget_failures("tile-1")
     assert shared.plan.ready(shared.states()) == ["tile-1"]
     do(shared, "tile-1")
     assert shared.plan.ready(shared.states()) == ["scene"]

@@ -18,8 +18,9 @@ from pathlib import Path
 
 import pytest
 
-from splatmill.schema import ModelCameras, Report, TrainOptions
+from splatmill.schema import Backend, ModelCameras, Report, TrainOptions
 from splatmill_worker import pipeline
+from splatmill_worker.kernels.gpu.device import absence
 from splatmill_worker.splat.formats import registry
 from splatmill_worker.tiles import coarse_model, command
 from splatmill_worker.tiles.folder import PlanFolder
@@ -83,7 +84,7 @@ def model_of(root: Path) -> bytes:
 
 
 def test_the_scene_is_as_good_as_in_one_piece(whole: Path, tmp_path: Path) -> None:
-    outcome = pipeline.run(whole / "capture", tmp_path, OPTIONS, lambda event: None, lambda: False)
+    outcome = pipeline.run(whole / "photos", tmp_path, OPTIONS, lambda event: None, lambda: False)
     assert outcome.trained is not None
     assert outcome.trained.held_out is not None
     ended = PlanFolder.open(whole).ended()
@@ -140,9 +141,9 @@ def test_the_bytes_are_the_same_whoever_does_the_units_and_one_of_them_is_killed
     end = time.monotonic() + 100
     while not list(claims.glob("tile-1*.claim")) and time.monotonic() < end:
         time.sleep(0.05)
-    time.sleep(0.5)
     killed.send_signal(signal.SIGKILL)
     killed.communicate()
+    assert list(claims.glob("tile-1*.claim")), "the unit was not done when its process was killed"
     both = [program("splatmill", "unit", str(root)) for _ in range(2)]
     texts = [process.communicate(timeout=250)[0] for process in both]
     assert [process.returncode for process in both] == [0, 0], texts
@@ -185,11 +186,22 @@ def test_another_option_repeats_only_what_depends_on_it_and_other_photos_all(
     assert "done already: cameras\n" in planned(whole / "photos", root, steps=60)
     assert PlanFolder.open(root).states() == {"cameras": "done"}
     assert "done already: cameras, coarse, tile-1, tile-2, scene\n" in planned(whole / "photos", root)
+    (root / "scene").unlink()
+    (root / "scene").symlink_to("units")  # as another plan may have left it
+    done("splatmill", "unit", str(root))
+    assert model_of(root) == model_of(whole)
     fewer = tmp_path / "fewer"
     shutil.copytree(whole / "photos", fewer)
     (fewer / "images" / "00.png").unlink()
     assert "done already" not in planned(fewer, root)
-    assert not (root / "capture" / "images" / "00.png").exists()
+    assert not (PlanFolder.open(root).capture / "images" / "00.png").exists()
+    # Refused options leave the plan that there is, and nothing of the photos.
+    before = sorted(path.name for path in root.iterdir())
+    process = program("splatmill", "plan", str(whole / "photos"), "-o", str(root), "--time-budget", "60")
+    text, _ = process.communicate(timeout=100)
+    assert process.returncode == command.REFUSED, text
+    assert sorted(path.name for path in root.iterdir()) == before
+    assert "done already" not in planned(fewer, root)
 
 
 def test_units_are_listed(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -222,9 +234,10 @@ def test_units_are_listed(whole: Path, tmp_path: Path, capsys: pytest.CaptureFix
 def test_options_of_a_training_in_one_piece_are_refused(
     given: dict[str, object], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    still_life.posed_capture(tmp_path / "capture")
     asked = TrainOptions.model_validate(given)
-    assert command.make_plan(tmp_path, asked.model_dump_json(), 2) == command.REFUSED
+    capture = still_life.posed_capture(tmp_path / "capture")
+    assert command.make_plan(tmp_path, capture, asked.model_dump_json(), 2) == command.REFUSED
+    assert not capture.exists()
     assert f"The option {next(iter(given))} is for" in capsys.readouterr().err
     assert not (tmp_path / "plan.json").exists()
 
@@ -232,9 +245,47 @@ def test_options_of_a_training_in_one_piece_are_refused(
 def test_a_capture_without_cameras_fails_once_and_says_why(tmp_path: Path) -> None:
     (tmp_path / "capture" / "images").mkdir(parents=True)
     (tmp_path / "capture" / "images" / "a.txt").write_text("no photo")
-    assert command.make_plan(tmp_path, OPTIONS.model_dump_json(), 2) == 0
+    assert command.make_plan(tmp_path, tmp_path / "capture", OPTIONS.model_dump_json(), 2) == 0
     process = program("splatmill", "unit", str(tmp_path))
     text, _ = process.communicate(timeout=100)
     assert process.returncode == command.FAILED
     assert "cameras    failed" in text
     assert "coarse     waiting   needs cameras" in text
+
+
+def test_photos_that_are_links_are_planned(whole: Path, tmp_path: Path) -> None:
+    photos = tmp_path / "photos"
+    (photos / "images").mkdir(parents=True)
+    shutil.copytree(whole / "photos" / "poses", photos / "poses")
+    for path in (whole / "photos" / "images").iterdir():
+        (photos / "images" / path.name).symlink_to(os.path.relpath(path, photos / "images"))
+    planned(photos, tmp_path / "plan")
+    capture = PlanFolder.open(tmp_path / "plan").capture
+    assert capture.name == PlanFolder.open(whole).capture.name
+    assert not any(path.is_symlink() for path in capture.rglob("*"))
+
+
+def test_an_attempt_that_another_machine_may_do_is_no_failure(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = OPTIONS.model_copy(update={"backend": Backend.gpu})
+    capture = still_life.posed_capture(tmp_path / "capture")
+    assert command.make_plan(tmp_path, capture, asked.model_dump_json(), 2) == 0
+    assert command.do_unit(tmp_path, "cameras") == 0
+    if absence() is None:
+        pytest.skip("this machine has a GPU")
+    assert command.do_unit(tmp_path, "coarse") == command.BROKEN
+    assert "gpu" in capsys.readouterr().err
+    assert PlanFolder.open(tmp_path).plan.ready(PlanFolder.open(tmp_path).states()) == ["coarse"]
+
+
+def test_a_failure_is_forgotten_with_a_new_plan(tmp_path: Path) -> None:
+    capture = still_life.posed_capture(tmp_path / "capture")
+    assert command.make_plan(tmp_path, capture, OPTIONS.model_dump_json(), 2) == 0
+    with PlanFolder.open(tmp_path).claimed("cameras") as run:
+        run.fail("No photo is left.", "")
+    assert PlanFolder.open(tmp_path).states() == {"cameras": "failed"}
+    again = still_life.posed_capture(tmp_path / "again")
+    assert command.make_plan(tmp_path, again, OPTIONS.model_dump_json(), 2) == 0
+    assert PlanFolder.open(tmp_path).states() == {}
+    assert not again.exists()

@@ -22,7 +22,7 @@ def test_a_walk_in_any_order_ends_with_the_scene_unless_what_it_needs_failed(see
     while ready := scene.ready(states):
         for name in ready:
             unit = scene.unit(name)
-            assert all(states.get(need) == "done" or need in unit.spares for need in unit.needs)
+            assert all(states.get(need) == "done" or need in unit.optional for need in unit.needs)
             assert all(need in states for need in unit.needs)
         name = choose.choice(ready)
         states[name] = "failed" if choose.random() < 0.15 else "done"

@@ -1,4 +1,4 @@
-"""The coarse model of a scene: what tiles start from and are trained before, as the files of the unit `coarse`."""
+"""The coarse model of a scene: what tiles start from and have as context, as the files of the unit `coarse`."""
 
 from __future__ import annotations
 

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
+import traceback
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -23,29 +26,46 @@ from splatmill.schema import (
     format_duration,
 )
 from splatmill.schema.quantities import listed
-from splatmill_worker.errors import Cancelled, Refusal, WorkerError
+from splatmill_worker.errors import (
+    Cancelled,
+    FailureName,
+    Refusal,
+    SfmFailed,
+    TrainingFailed,
+    WorkerError,
+)
 from splatmill_worker.tiles.folder import SCENE, Claimed, PlanFolder, digest_of, facts_of
 from splatmill_worker.tiles.units import ScenePlan
 
-REFUSED, FAILED, UNWRITABLE, STOPPED, CLAIMED = 5, 3, 1, 130, 75
+REFUSED, FAILED, UNWRITABLE, STOPPED, CLAIMED, BROKEN = 5, 3, 1, 130, 75, 70
 """Exit statuses, those of the command line: the plan or its photos cannot be used; a unit failed; a folder could not be
-written; Ctrl-C; another process runs the unit."""
+written; Ctrl-C; another process runs the unit; a unit ended in a way that another attempt may not."""
 
 MOST_TILES = 1024
 
 POLL_SECONDS = 2.0
 """Time between two looks for units, while other processes run those that the next ones need."""
 
-MOST_CRASHES = 3
-"""Times that a unit's process may be killed before the unit counts as failed."""
+MOST_ATTEMPTS = 3
+"""Attempts at a unit by one process, of which none published and none recorded a failure, after which it counts as
+failed."""
+
+SIGNAL_SECONDS = 0.1
+"""Time after which a request to stop reaches the process of a unit."""
 
 LINE_SECONDS = 5.0
 """Time between two lines of progress."""
 
 
-def make_plan(root: Path, options: str, tiles: int) -> int:
-    """Write the plan of the capture in `root`, with TrainOptions as JSON; returns the exit status."""
-    return _reported(lambda: _make_plan(root, TrainOptions.model_validate_json(options), tiles))
+def make_plan(root: Path, capture: Path, options: str, tiles: int) -> int:
+    """Write the plan of the folder `capture`, which is moved into `root`; returns the exit status.
+
+    options: TrainOptions as JSON. Where the plan is refused, `capture` is removed, and an earlier plan stays as it is.
+    """
+    try:
+        return _reported(lambda: _make_plan(root, capture, TrainOptions.model_validate_json(options), tiles))
+    finally:
+        shutil.rmtree(capture, ignore_errors=True)
 
 
 def do_unit(root: Path, name: str | None) -> int:
@@ -85,10 +105,14 @@ def _reported(run: Callable[[], int]) -> int:
         return STOPPED
 
 
-def _make_plan(root: Path, options: TrainOptions, tiles: int) -> int:
+def _make_plan(root: Path, capture: Path, options: TrainOptions, tiles: int) -> int:
     _check(options, tiles)
-    folder = PlanFolder(root, ScenePlan(digest_of(root / "capture"), options, tiles))
+    folder = PlanFolder(root, ScenePlan(digest_of(capture), options, tiles))
+    if not folder.capture.exists():
+        folder.capture.parent.mkdir(parents=True, exist_ok=True)
+        capture.rename(folder.capture)
     folder.save()
+    folder.forget_failures(*(unit.name for unit in folder.plan.units))
     kept = [name for name, ended in folder.ended().items() if ended.state == "done"]
     print(f"{len(folder.plan.units)} units: {listed([unit.name for unit in folder.plan.units], 4)}")
     if kept:
@@ -133,9 +157,7 @@ def _do_one(root: Path, name: str) -> int:
         raise Refusal(
             "option_out_of_range", f"The plan has no unit {name!r}.", advice=f"Its units are {names}."
         ) from None
-    ended = folder.ended().get(name)
-    if ended is not None and ended.state == "done":
-        print(f"{name} is done already.")
+    if _is_done(folder, name):
         return 0
     missing = folder.plan.missing(name, folder.states())
     if missing:
@@ -144,32 +166,67 @@ def _do_one(root: Path, name: str) -> int:
             f"{name} needs {listed(missing, 6)} first.",
             advice=f"splatmill unit {root} does all units in their order.",
         )
-    folder.forget_failure(name)
+    if folder.states().get(name) == "failed":
+        by = folder.running("scene")
+        if name in folder.plan.unit("scene").optional and by is not None:
+            print(
+                f"The scene without {name} is being made by {by}; try again when it is done.", file=sys.stderr
+            )
+            return CLAIMED
+        folder.forget_failures(name)
     stopped = _StopSignals()
     try:
         with folder.claimed(name) as run:
+            if _is_done(folder, name):  # by a process that was faster
+                return 0
             try:
                 run_unit(Context(folder, run, _Lines(name), lambda: stopped.asked or not run.held()))
-            except Cancelled:
+            except Exception as error:
                 if stopped.asked:
+                    raise Cancelled from error
+                if not run.owned():
+                    raise Claimed from error
+                if isinstance(error, WorkerError) and not _may_pass(error):
+                    run.fail(error.message, error.advice or "")
                     raise
-                raise Claimed from None
-            except WorkerError as failure:
-                run.fail(failure.message, failure.advice or "")
-                raise
+                if isinstance(error, WorkerError):
+                    print(
+                        f"Error: {error} Another machine may do {name}, or this one later.", file=sys.stderr
+                    )
+                else:
+                    traceback.print_exc()
+                return BROKEN
+            if name == "scene":
+                _link_scene(folder.root, run.path)
     except Claimed:
         print(f"{name} is run by {folder.running(name) or 'another process'}.", file=sys.stderr)
         return CLAIMED
-    if name == "scene":
-        _link_scene(folder)
     return 0
+
+
+def _is_done(folder: PlanFolder, name: str) -> bool:
+    """Whether the unit is done, which is printed; the scene is linked then."""
+    ended = folder.ended().get(name)
+    if ended is None or ended.path is None:
+        return False
+    if name == "scene":
+        _link_scene(folder.root, ended.path)
+    print(f"{name} is done already.")
+    return True
+
+
+def _may_pass(error: WorkerError) -> bool:
+    """Whether another machine, or this one at another time, may do a unit that ended with this error."""
+    if isinstance(error, TrainingFailed):
+        return error.name is FailureName.memory
+    return error.code == "backend_unavailable" or not isinstance(error, Refusal | SfmFailed)
 
 
 def _do_all(root: Path) -> int:
     """Do units, each in a process of its own, until the scene is done or nothing can be done any more."""
     folder = PlanFolder.open(root)
     stopped = _StopSignals()
-    crashes: dict[str, int] = {}
+    attempts: dict[str, int] = {}
     while True:
         folder = PlanFolder.open(root)
         states = folder.states()
@@ -185,18 +242,19 @@ def _do_all(root: Path) -> int:
             status = _in_process(root, name, stopped)
             if stopped.asked:
                 raise KeyboardInterrupt
-            if status < 0:
-                crashes[name] = crashes.get(name, 0) + 1
-                if crashes[name] >= MOST_CRASHES:
-                    _give_up(folder, name, -status)
-            elif status not in (0, FAILED, REFUSED, CLAIMED):
+            if status == UNWRITABLE:
                 return status
+            if status not in (0, CLAIMED):
+                attempts[name] = attempts.get(name, 0) + 1
+                if attempts[name] >= MOST_ATTEMPTS:
+                    _give_up(folder, name, status)
         if stopped.asked:
             raise KeyboardInterrupt
     print(_table(_rows(folder)))
     scene = folder.ended().get("scene")
     if scene is None or scene.path is None:
         return FAILED
+    _link_scene(root, scene.path)
     print(root / SCENE / "model.ply")
     return 0
 
@@ -206,38 +264,31 @@ def _in_process(root: Path, name: str, stopped: _StopSignals) -> int:
     child = subprocess.Popen([sys.executable, "-m", "splatmill_worker", "unit", str(root), name])
     while True:
         try:
-            return child.wait(timeout=POLL_SECONDS)
+            return child.wait(timeout=SIGNAL_SECONDS)
         except subprocess.TimeoutExpired:
             if stopped.asked:
                 child.send_signal(signal.SIGTERM)
-        except KeyboardInterrupt:
-            stopped.asked = True
 
 
-def _give_up(folder: PlanFolder, name: str, number: int) -> None:
-    """Record that the process of a unit was killed too often."""
-    message = f"The process of {name} was ended {MOST_CRASHES} times by signal {number}" + (
-        " (out of memory, most often)." if number == signal.SIGKILL else "."
-    )
-    try:
-        with folder.claimed(name) as run:
-            run.fail(
-                message,
-                "Use more tiles, a smaller image_size or fewer max_gaussians, or a machine with more memory.",
-            )
-    except Claimed:
-        return
+def _give_up(folder: PlanFolder, name: str, status: int) -> None:
+    """Record that a unit was tried too often. status: of its last process, negative for a signal."""
+    if status == -signal.SIGKILL:
+        ended = "its process was killed, most often because memory ran out"
+        advice = "Use more tiles, a smaller image_size or fewer max_gaussians, or a machine with more memory."
+    else:
+        ended = f"its process ended with status {status}"
+        advice = f"splatmill unit {folder.root} {name} does it alone, and shows why."
+    with suppress(Claimed), folder.claimed(name) as run:
+        if name not in folder.states():
+            run.fail(f"{name} was tried {MOST_ATTEMPTS} times, and {ended}.", advice)
 
 
-def _link_scene(folder: PlanFolder) -> None:
-    """Let `scene` in the folder of the plan be the output of the last unit."""
-    path = folder.ended()["scene"].path
-    assert path is not None
-    link = folder.root / SCENE
-    new = folder.root / f".{SCENE}.{path.name}"
+def _link_scene(root: Path, path: Path) -> None:
+    """Let `scene` in the folder of the plan be the output of the last unit, which lies at `path`."""
+    new = root / f".{SCENE}.{os.getpid()}"
     new.unlink(missing_ok=True)
-    new.symlink_to(path.relative_to(folder.root), target_is_directory=True)
-    new.replace(link)
+    new.symlink_to(path.relative_to(root), target_is_directory=True)
+    new.replace(root / SCENE)
 
 
 def _rows(folder: PlanFolder) -> list[dict[str, Any]]:

@@ -10,19 +10,17 @@ import socket
 import threading
 import uuid
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-import psutil
 
 from splatmill.files import atomic_write
 from splatmill_worker.errors import Refusal
 from splatmill_worker.tiles.units import ScenePlan, State
 
-PLAN, CAPTURE, UNITS, SCENE = "plan.json", "capture", "units", "scene"
-"""The plan, the files of the capture, the outputs of the units, and a link to the output of the last one."""
+PLAN, CAPTURES, UNITS, SCENE = "plan.json", "captures", "units", "scene"
+"""The plan, captures by their digests, the outputs of the units, and a link to the output of the last one."""
 
 CLAIM_SECONDS = 60.0
 """Age of a claim from which its process counts as gone."""
@@ -67,7 +65,7 @@ class PlanFolder:
 
     @staticmethod
     def open(root: Path) -> PlanFolder:
-        """The folder that `create` made. Raises Refusal where there is no plan, or none that can be read."""
+        """The folder in which a plan was saved. Raises Refusal where there is no plan, or none that can be read."""
         path = root / PLAN
         if not path.is_file():
             raise Refusal(
@@ -91,8 +89,8 @@ class PlanFolder:
 
     @property
     def capture(self) -> Path:
-        """The folder of the photos."""
-        return self.root / CAPTURE
+        """The folder of the photos. That of another capture has another name, so that none changes under a unit."""
+        return self.root / CAPTURES / self.plan.digest[:16]
 
     def states(self) -> dict[str, State]:
         """The units that have ended, by name."""
@@ -126,11 +124,12 @@ class PlanFolder:
             return None
         return f"{document.get('host')}, process {document.get('pid')}"
 
-    def forget_failure(self, name: str) -> None:
-        """Let a unit that failed be run again."""
+    def forget_failures(self, *names: str) -> None:
+        """Let units that failed be run again."""
         states = self.states()
-        states.pop(name, None)
-        self._path(name, states).with_suffix(".failed.json").unlink(missing_ok=True)
+        for name in names:
+            states.pop(name, None)
+            self._path(name, states).with_suffix(".failed.json").unlink(missing_ok=True)
 
     @contextmanager
     def claimed(self, name: str) -> Iterator[Run]:
@@ -151,7 +150,7 @@ class PlanFolder:
         beat = threading.Thread(target=self._renew, args=(claim, token, ended, held), daemon=True)
         beat.start()
         try:
-            yield Run(name, path, work, held.is_set)
+            yield Run(name, path, work, held.is_set, lambda: _token(claim) == token)
         finally:
             ended.set()
             beat.join()
@@ -181,16 +180,22 @@ class PlanFolder:
 
     def _remove_stale(self, claim: Path, token: str) -> None:
         """Remove a claim that nobody renews, with what its process left. Raises Claimed for one that is renewed."""
+        gone = _token(claim)
         try:
             if self._age(claim) <= CLAIM_SECONDS and not _has_ended(claim):
                 raise Claimed
             aside = claim.with_name(f"{claim.name}.{token}.stale")
-            claim.rename(aside)  # one of several processes succeeds
+            claim.rename(aside)
         except FileNotFoundError:
             return
-        if (gone := _token(aside)) is not None:
+        try:
+            if _token(aside) != gone:  # another process was faster, and this claim is its own
+                with suppress(FileExistsError):
+                    os.link(aside, claim)
+                raise Claimed
             shutil.rmtree(claim.with_name(f"{claim.stem}.{gone}.work"), ignore_errors=True)
-        aside.unlink(missing_ok=True)
+        finally:
+            aside.unlink(missing_ok=True)
 
     def _age(self, claim: Path) -> float:
         """Seconds since a claim was renewed, by the clock of the file system: those of machines differ."""
@@ -204,16 +209,17 @@ class PlanFolder:
     def _renew(self, claim: Path, token: str, ended: threading.Event, held: threading.Event) -> None:
         """Renew the claim until `ended`; clear `held` when it is another's, as after this process was frozen."""
         while not ended.wait(self.beat_seconds):
-            if _token(claim) != token:
-                held.clear()
-                return
             try:
-                os.utime(claim)
+                mine = json.loads(claim.read_text("utf-8")).get("token") == token
+                if mine:
+                    os.utime(claim)
             except FileNotFoundError:
+                mine = False
+            except (OSError, ValueError):
+                continue  # the file system does not answer; the claim holds for CLAIM_SECONDS
+            if not mine:
                 held.clear()
                 return
-            except OSError:
-                continue  # the file system does not answer; the claim holds for CLAIM_SECONDS
 
 
 @dataclass(frozen=True)
@@ -223,13 +229,15 @@ class Run:
     name: of the unit.
     path: folder that its output will have.
     work: folder for files of this run, removed when it ends.
-    held: whether the unit is still this process's; false after it was frozen for long.
+    held: whether the unit is still this process's, as of the last renewal; false after it was frozen for long.
+    owned: the same as of now, which reads the claim.
     """
 
     name: str
     path: Path
     work: Path
     held: Callable[[], bool]
+    owned: Callable[[], bool]
 
     @property
     def out(self) -> Path:
@@ -248,7 +256,7 @@ class Run:
 
     def fail(self, failure: str, advice: str) -> None:
         """Record that the unit cannot be done, unless another process has it by now."""
-        if self.held():
+        if self.owned():
             document = json.dumps({"failure": failure, "advice": advice})
             atomic_write(self.path.with_suffix(".failed.json"), document)
 
@@ -279,27 +287,39 @@ def _read(path: Path) -> dict[str, Any] | None:
 
 def _process() -> dict[str, Any]:
     """This process, so that others on the same machine see whether it still runs."""
-    namespace = Path("/proc/self/ns/pid")
     return {
         "host": socket.gethostname(),
-        "namespace": os.readlink(namespace) if namespace.is_symlink() else "",
         "pid": os.getpid(),
-        "started": psutil.Process().create_time(),
+        "machine": _machine(),
+        "started": _started(os.getpid()),
     }
+
+
+def _machine() -> str | None:
+    """What names the running system and its view of processes, on Linux; None elsewhere."""
+    try:
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text("ascii").strip()
+        return f"{boot} {os.readlink('/proc/self/ns/pid')}"
+    except OSError:
+        return None
+
+
+def _started(pid: int) -> int | None:
+    """When a process began, in ticks since the system did, which no setting of a clock changes; None without it."""
+    try:
+        return int(Path(f"/proc/{pid}/stat").read_text("utf-8").rpartition(")")[2].split()[19])
+    except (OSError, ValueError, IndexError):
+        return None
 
 
 def _has_ended(claim: Path) -> bool:
     """Whether the process of a claim was one of this machine and runs no more; False where that cannot be seen."""
-    theirs, ours = _read(claim) or {}, _process()
-    if any(theirs.get(name) != ours[name] for name in ("host", "namespace")):
+    theirs, machine = _read(claim) or {}, _machine()
+    if machine is None or theirs.get("machine") != machine or not isinstance(theirs.get("pid"), int):
         return False
-    try:
-        return bool(psutil.Process(int(theirs["pid"])).create_time() != theirs["started"])
-    except psutil.NoSuchProcess:
-        return True
-    except (psutil.Error, KeyError, TypeError, ValueError):
-        return False
+    return _started(theirs["pid"]) != theirs.get("started")
 
 
 def _token(claim: Path) -> str | None:
-    return str((_read(claim) or {}).get("token"))
+    document = _read(claim)
+    return None if document is None else str(document.get("token"))

@@ -110,7 +110,7 @@ def write_scene(joining: Joining) -> dict[str, Any]:
     photos = _corrected(planned_photos(cameras, planned, stages), coarse)
     planned = replace(planned, plan=_stated(joining))
     gaussians = joining.gaussians()
-    engine = open_engine(gaussians, coarse.plan.kernels)
+    engine = open_engine(gaussians, job.kernels)
     trained = _trained(joining, engine, photos)
     record = Recording(TrainingEvents(job.emit, job.workdir, coarse.plan, photos.shown), None, None)
     for sentence in joining.failures:
@@ -151,7 +151,10 @@ def _stated(joining: Joining) -> Plan:
         f"All tiles together may have about {joining.coarse.most}."
     )
     return replace(
-        plan, max_gaussians=joining.coarse.most, reasons={**plan.reasons, "max_gaussians": because}
+        plan,
+        max_gaussians=joining.coarse.most,
+        kernels=joining.job.kernels,
+        reasons={**plan.reasons, "max_gaussians": because},
     )
 
 

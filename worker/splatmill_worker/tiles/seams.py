@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -14,6 +14,7 @@ from splatmill_worker.splat.gaussians import SH_C0, Gaussians
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.train.renderer import evaluation_background, renderer
 from splatmill_worker.splat.views import TrainingView
+from splatmill_worker.tiles.visibility import reduced
 
 MOST_LIGHT = 0.9
 """Share of a pixel's light that one tile has at most where the pixel counts as a seam."""
@@ -57,10 +58,7 @@ class Seams:
     """
 
     def __init__(self, coarse: Gaussians, members: Sequence[Tensor], plan: Plan) -> None:
-        self._coarse, self._plan = coarse, plan
-        self._engines = [
-            CpuEngine(_with_colors(coarse, members[first : first + 3])) for first in range(0, len(members), 3)
-        ]
+        self._coarse, self._members, self._plan = coarse, members, plan
 
     def measured(self, scene: Gaussians, views: Sequence[TrainingView]) -> SeamScore:
         """The errors of `scene` and of the coarse model on the two parts of `views`."""
@@ -68,10 +66,9 @@ class Seams:
         renders = [renderer(CpuEngine(each), self._plan) for each in (scene, self._coarse)]
         sums = torch.zeros(2, 2, dtype=torch.float64)  # by model, then seams and others
         counts = torch.zeros(2, dtype=torch.float64)
-        for view in views:
+        for view, seams in zip(views, self._of(views), strict=True):
             target = view.full
             used = torch.ones(target.rgb.shape[:2], dtype=torch.bool) if target.mask is None else target.mask
-            seams = self._seams(view)
             parts = [used & seams, used & ~seams]
             counts += torch.tensor([float(part.sum()) for part in parts])
             photo = target.over(background).float() / 255.0
@@ -85,23 +82,32 @@ class Seams:
         ]
         return SeamScore(float(counts[0] / counts.sum().clamp_min(1.0)), *values)
 
-    def _seams(self, view: TrainingView) -> Tensor:
-        """bool [H, W]: pixels that the scene fills, and most of whose light is of no one tile."""
-        camera = view.full.camera
-        largest = torch.zeros(camera.height, camera.width)
-        light = torch.zeros_like(largest)
-        for engine in self._engines:
-            shares, _, _ = engine.forward(
-                view.full.viewmat,
-                view.full.K,
-                camera.width,
-                camera.height,
-                degree=0,
-                antialias=self._plan.antialias,
-            )
-            largest = torch.maximum(largest, shares.amax(dim=2))
-            light += shares.sum(dim=2)
-        return (largest < MOST_LIGHT * light) & (light > 0.5)
+    def _of(self, views: Sequence[TrainingView]) -> Iterator[Tensor]:
+        """For each view bool [H, W]: pixels that the scene fills, and most of whose light is of no one tile.
+
+        They are found on views reduced as for the parts of photos, of three tiles at a time, so that many tiles need
+        the memory of three.
+        """
+        cameras = [reduced(view.full.camera) for view in views]
+        largest = [torch.zeros(camera.height, camera.width) for camera in cameras]
+        light = [torch.zeros_like(each) for each in largest]
+        for first in range(0, len(self._members), 3):
+            engine = CpuEngine(_with_colors(self._coarse, self._members[first : first + 3]))
+            for index, camera in enumerate(cameras):
+                shares, _, _ = engine.forward(
+                    torch.as_tensor(camera.viewmat, dtype=torch.float32),
+                    torch.as_tensor(camera.K, dtype=torch.float32),
+                    camera.width,
+                    camera.height,
+                    degree=0,
+                    antialias=self._plan.antialias,
+                )
+                largest[index] = torch.maximum(largest[index], shares.amax(dim=2))
+                light[index] += shares.sum(dim=2)
+        for view, most, whole in zip(views, largest, light, strict=True):
+            seams = (most < MOST_LIGHT * whole) & (whole > 0.5)
+            size = view.full.rgb.shape[:2]
+            yield torch.nn.functional.interpolate(seams[None, None].float(), size=size)[0, 0] > 0
 
 
 def _with_colors(coarse: Gaussians, members: Sequence[Tensor]) -> Gaussians:

@@ -10,8 +10,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from splatmill.schema import TrainOptions
-from splatmill_worker.errors import Refusal
+from splatmill.schema import Backend, TrainOptions
+from splatmill_worker.images.decoding import decoders
 from splatmill_worker.images.load import training_size
 from splatmill_worker.pipeline.cameras import Cameras, recover_cameras
 from splatmill_worker.pipeline.events import Emit
@@ -23,7 +23,7 @@ from splatmill_worker.pipeline.training import train_scene
 from splatmill_worker.splat.engine.open import open_engine
 from splatmill_worker.splat.plan.capacity import resolved
 from splatmill_worker.splat.plan.photos import loading_size
-from splatmill_worker.splat.plan.plan import Plan
+from splatmill_worker.splat.plan.plan import Kernels, Plan
 from splatmill_worker.tiles import coarse_model, joined
 from splatmill_worker.tiles.cells import divide
 from splatmill_worker.tiles.folder import PlanFolder, Run, facts_of
@@ -32,6 +32,9 @@ from splatmill_worker.tiles.units import ScenePlan
 
 STEPS_SHARE = 0.5
 """Share of the steps of a whole run that the coarse model takes, and that each tile takes after it."""
+
+ENDED = "ended_decoders.json"
+"""File in a work folder that names the photos which end the process that decodes them."""
 
 SFM = "sfm"
 """Folder of the recovered cameras in a work folder, and in the output of the unit `cameras`."""
@@ -53,15 +56,20 @@ class Context:
     cancelled: Callable[[], bool]
 
     def job(self, options: TrainOptions) -> Job:
-        """A job in the work folder of the unit, which has the recovered cameras there are."""
+        """A job in the work folder of the unit, which has the recovered cameras there are.
+
+        The coarse model alone is trained by the kernels of the options; the others run on machines with a GPU and
+        without. Raises Refusal where those kernels do not run here.
+        """
         work = self.run.work
         work.joinpath("out").mkdir(exist_ok=True)
         cameras = self.folder.ended().get("cameras")
         if cameras is not None and cameras.path is not None and (cameras.path / SFM).is_dir():
             shutil.copytree(cameras.path / SFM, work / SFM, dirs_exist_ok=True)
-        return Job(
-            self.folder.capture, work, options, choose_kernels(options), self.emit, self.cancelled, looks=None
-        )
+        kernels: Kernels = "reference" if options.backend is Backend.reference else "cpu"
+        if self.run.name == "coarse":
+            kernels = choose_kernels(options)
+        return Job(self.folder.capture, work, options, kernels, self.emit, self.cancelled, looks=None)
 
     def output(self, unit: str) -> Path:
         """The folder of the output of a unit that is done."""
@@ -74,24 +82,31 @@ def run_unit(context: Context) -> None:
     """Do the unit that `context` holds, and publish its output. Raises WorkerError for what would fail again."""
     name, started = context.run.name, time.perf_counter()
     stages = Stages(context.run.work / "stages.json")
-    if name == "cameras":
-        facts = _cameras(context, stages)
-    elif name == "coarse":
-        facts = _coarse(context, stages)
-    elif name == "scene":
-        facts = joined.write_scene(_joining(context, stages))
-    else:
-        facts = _tile(context, stages)
+    readable = [context.folder.capture.resolve(), context.run.work.resolve()]
+    with decoders.confined(readable, context.run.work / ENDED, context.cancelled):
+        if name == "cameras":
+            facts = _cameras(context, stages)
+        elif name == "coarse":
+            facts = _coarse(context, stages)
+        elif name == "scene":
+            facts = joined.write_scene(_joining(context, stages))
+        else:
+            facts = _tile(context, stages)
     context.run.publish({"seconds": round(time.perf_counter() - started, 1), **facts})
 
 
 def _cameras(context: Context, stages: Stages) -> dict[str, Any]:
     job = context.job(context.folder.plan.options)
     cameras = recover_cameras(job, stages)
-    found = sorted((job.workdir / SFM).glob("*/model-*"))
+    folder = job.workdir / SFM
     shutil.rmtree(context.run.out)  # what recovering leaves there is not for others
-    for model in found:
+    for model in sorted(folder.glob("*/model-*")):
         shutil.copytree(model, context.run.out / model.relative_to(job.workdir))
+    for points in sorted(folder.rglob("*.npz")):  # triangulated, and of stereo
+        target = context.run.out / points.relative_to(job.workdir)
+        if not target.exists():
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(points, target)
     return {"photos": len(cameras.training), "held_out": len(cameras.held_out)}
 
 
@@ -171,9 +186,7 @@ def _most(cameras: Cameras, job: Job) -> int:
         return job.options.max_gaussians
     size = loading_size(job.options, job.kernels)
     pixels = [math.prod(training_size(v.camera.width, v.camera.height, size)) for v in cameras.training]
-    if not pixels:
-        raise Refusal("too_few_photos", "No photo is left to train on.")
-    return resolved(sum(pixels) / len(pixels), len(pixels))
+    return resolved(sum(pixels) / max(1, len(pixels)), len(pixels))
 
 
 def _shorter(plan: Plan) -> Plan:

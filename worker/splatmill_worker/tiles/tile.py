@@ -1,4 +1,4 @@
-"""Trains one tile: the Gaussians in and next to its cell, before the coarse model of everything else."""
+"""Trains one tile: the Gaussians in and next to its cell, with the coarse model of the rest as a fixed context."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from splatmill_worker.pipeline.photos import Room
 from splatmill_worker.pipeline.stage_times import Stages
 from splatmill_worker.pipeline.training import EXTENT
 from splatmill_worker.scene import View
+from splatmill_worker.sfm.callbacks import stop_if
 from splatmill_worker.splat.engine.open import open_engine
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.plan.photos import BYTES_PER_PIXEL, fit_in_memory
@@ -163,17 +164,19 @@ def _views(tile: Tile, members: Tensor) -> Iterator[TrainingView]:
     """The parts of the training photos that show the members, bool [N], in files where memory is too small for them."""
     coarse, cameras = tile.coarse, tile.cameras
     size = coarse.plan.image_size
-    reduced = []
+    placed = []
     for view in cameras.training:
+        stop_if(tile.job.cancelled)
         camera = view.camera.scaled_to(*training_size(view.camera.width, view.camera.height, size))
-        reduced.append(coarse.corrected(view.name, cameras.normalization.camera(camera)))
-    found = parts(coarse.gaussians, members, reduced, antialias=coarse.plan.antialias)
+        placed.append(coarse.corrected(view.name, cameras.normalization.camera(camera)))
+    found = parts(coarse.gaussians, members, placed, antialias=coarse.plan.antialias)
     chosen = [(view, part) for view, part in zip(cameras.training, found, strict=True) if part is not None]
     room = Room.of(tile.job)
     taken = BYTES_PER_PIXEL * sum(part.pixels for _, part in chosen)
     files = None if fit_in_memory(taken, room.memory) else PixelFiles(room.folder)
     with ThreadPoolExecutor(2) as pool:
         for first in range(0, len(chosen), LOADED):
+            stop_if(tile.job.cancelled)
             some = chosen[first : first + LOADED]
             yield from pool.map(lambda each: _part_of(tile, each[0], each[1], size, files), some)
             tile.job.emit(ProgressEvent(stage="loading", done=first + len(some), total=len(chosen)))

@@ -25,12 +25,12 @@ class Unit:
 
     name: unique in its plan.
     needs: names of the units whose output it reads.
-    spares: those of them that may have failed: the unit does without their output.
+    optional: those of them that may have failed: the unit does without their output.
     """
 
     name: str
     needs: tuple[str, ...] = ()
-    spares: tuple[str, ...] = ()
+    optional: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class ScenePlan:
             own["options"] = {option: options[option] for option in CAMERA_OPTIONS}
         else:
             own |= {"options": options, "tiles": self.tiles}
-            own["failed"] = [spare for spare in self.unit(name).spares if states.get(spare) == "failed"]
+            own["failed"] = [need for need in self.unit(name).optional if states.get(need) == "failed"]
         return hashlib.sha256(json.dumps(own, sort_keys=True).encode()).hexdigest()[:16]
 
     def ready(self, states: Mapping[str, State]) -> list[str]:
@@ -89,7 +89,7 @@ class ScenePlan:
         return [
             need
             for need in unit.needs
-            if states.get(need) != "done" and not (need in unit.spares and states.get(need) == "failed")
+            if states.get(need) != "done" and not (need in unit.optional and states.get(need) == "failed")
         ]
 
     def as_dict(self) -> dict[str, Any]:

@@ -79,7 +79,7 @@ def parts(
         Gaussians(gaussians.means, gaussians.log_scales, gaussians.quats, gaussians.logit_opacities, share)
     )
     for camera in cameras:
-        small = camera.scaled_to(max(1, camera.width // REDUCED), max(1, camera.height // REDUCED))
+        small = reduced(camera)
         light, _, _ = engine.forward(
             torch.as_tensor(small.viewmat, dtype=torch.float32),
             torch.as_tensor(small.K, dtype=torch.float32),
@@ -89,6 +89,11 @@ def parts(
             antialias=antialias,
         )
         yield _part(light[..., 0] >= LEAST_LIGHT, camera.width, camera.height)
+
+
+def reduced(camera: Camera) -> Camera:
+    """The camera for its photo reduced by REDUCED."""
+    return camera.scaled_to(max(1, camera.width // REDUCED), max(1, camera.height // REDUCED))
 
 
 def _part(shown: Tensor, width: int, height: int) -> Part | None:

@@ -1,6 +1,7 @@
 """`splatmill plan`, `unit` and `units`: a scene in tiles, on this machine or on all that share a folder."""
 
 import os
+import secrets
 import shutil
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,9 +14,6 @@ from splatmill.errors import NothingToUpload
 from splatmill.schema import format_bytes
 from splatmill.transfer.local_capture import LocalFile, find_files, printable
 from splatmill.transfer.training_options import train_options
-
-CAPTURE = "capture"
-"""Folder of the photos in the folder of a plan."""
 
 
 @with_training_options
@@ -54,10 +52,12 @@ def plan(
     typer.echo(f"{', '.join(capture_files.contents())}, {format_bytes(capture_files.bytes)}")
     for sentence in capture_files.remarks:
         typer.echo(printable(sentence), err=True)
-    _copy(capture_files.files, out / CAPTURE)
+    capture = _copied(capture_files.files, out)
     exec_module(
         "splatmill_worker",
         "plan",
+        "--capture",
+        str(capture),
         "--tiles",
         str(tiles),
         "--options",
@@ -93,16 +93,21 @@ def units(
     exec_module("splatmill_worker", "units", *(["--json"] if as_json else []), "--", str(folder))
 
 
-def _copy(files: tuple[LocalFile, ...], capture: Path) -> None:
-    """Make `capture` the folder of these files and no others, with links where the file system has them."""
-    new = capture.with_name(f"{capture.name}.new")
-    shutil.rmtree(new, ignore_errors=True)
-    for file in files:
-        target = new / file.role.value / file.name
-        target.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            os.link(file.path, target)
-        except OSError:  # another file system, or one without links
-            shutil.copyfile(file.path, target)
-    shutil.rmtree(capture, ignore_errors=True)
-    new.rename(capture)
+def _copied(files: tuple[LocalFile, ...], plan: Path) -> Path:
+    """A new folder in that of a plan with these files: links to them where the file system has links."""
+    new = plan / f".capture-{secrets.token_hex(8)}"
+    new.mkdir(parents=True)
+    try:
+        for file in files:
+            target = new / file.role.value / file.name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                os.link(file.path.resolve(), target)
+            except FileExistsError:
+                raise
+            except OSError:  # another file system, or one without links
+                shutil.copyfile(file.path, target)
+    except BaseException:
+        shutil.rmtree(new, ignore_errors=True)
+        raise
+    return new

@@ -175,6 +175,7 @@ def _read(
                     f"{camera.height}",
                 )
             if sure is not None:
+                name = f"{sure.parent.name}/{sure.name}"
                 read.sure[index] = _confidence(sure, (height, width))
             read.levels[index] = levels
         except UnusablePicture as error:
