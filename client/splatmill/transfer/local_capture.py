@@ -125,6 +125,14 @@ class Found:
         """Whether the files are a single photo without cameras."""
         return self.contents() == ["1 photo"]
 
+    def refuse_one_photo(self) -> None:
+        """Raise NothingToUpload where all there is to train on is one photo."""
+        if self.is_one_photo:
+            raise NothingToUpload(
+                f"{printable(self.files[0].name)} is one photo; depth cannot be recovered from a single photo.",
+                "Give a folder with 20 or more photos from different places, a video, or a zip archive.",
+            )
+
     @property
     def bytes(self) -> int:
         """The total size of the files in bytes."""

@@ -1,4 +1,4 @@
-"""Proves that up is told from the cameras of a model, and that a `.glb` of it and of its mesh then stands upright.
+"""Proves that up follows from the cameras of a model, and that a `.glb` of it and of its mesh then stands upright.
 
 What programs of others make of the rotation of a node is theirs; glTF asks for it.
 """

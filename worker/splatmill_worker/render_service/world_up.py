@@ -16,11 +16,11 @@ NEAR = np.cos(np.radians(20.0))
 """Cosine of the angle to an axis of the world, up to which it is meant: programs give one to up."""
 
 FEWEST = 3
-"""Cameras from which up is told."""
+"""Cameras that a world needs for its up to be known."""
 
 
 def up_of(stored: ModelCameras | None) -> Up | None:
-    """A unit vector up, in the world of a model with these cameras; None where they do not tell.
+    """A unit vector up, in the world of a model with these cameras; None where it does not follow from them.
 
     It is the axis of the world that is nearest to what is up for most of the photos. In a world that has none, as that
     of a COLMAP model, it is that direction itself, if nothing speaks against it.

@@ -10,7 +10,6 @@ import typer
 
 from splatmill.cli.local.programs import exec_module, require
 from splatmill.cli.schema_options import with_training_options
-from splatmill.errors import NothingToUpload
 from splatmill.schema import format_bytes
 from splatmill.transfer.local_capture import LocalFile, find_files, printable
 from splatmill.transfer.training_options import train_options
@@ -43,11 +42,7 @@ def plan(
     arguments = {key: value for key, value in options.items() if value is not None and value != []}
     checked = train_options(arguments)
     capture_files = find_files(path)
-    if capture_files.is_one_photo:
-        raise NothingToUpload(
-            f"{printable(capture_files.files[0].name)} is one photo; depth cannot be recovered from a single photo.",
-            "Give a folder with 20 or more photos from different places, a video, or a zip archive.",
-        )
+    capture_files.refuse_one_photo()
     require("splatmill_worker", "Planning a scene")
     typer.echo(f"{', '.join(capture_files.contents())}, {format_bytes(capture_files.bytes)}")
     for sentence in capture_files.remarks:

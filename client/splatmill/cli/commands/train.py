@@ -21,7 +21,7 @@ from splatmill.cli.local.folder_lock import locked
 from splatmill.cli.local.unfinished import Unfinished, size_text
 from splatmill.cli.schema_options import with_training_options
 from splatmill.cli.servers import open_client
-from splatmill.errors import JobCancelled, NothingToUpload
+from splatmill.errors import JobCancelled
 from splatmill.schema import Capture, TrainOptions, format_bytes
 from splatmill.schema.quantities import listed
 from splatmill.transfer.local_capture import Found, LocalFile, find_files, printable, start_model
@@ -111,11 +111,7 @@ def train(
     arguments, start = with_start_model(arguments, path)
     checked = train_options(arguments)
     capture_files = find_files(path)
-    if capture_files.is_one_photo:
-        raise NothingToUpload(
-            f"{printable(capture_files.files[0].name)} is one photo; depth cannot be recovered from a single photo.",
-            "Give a folder with 20 or more photos from different places, a video, or a zip archive.",
-        )
+    capture_files.refuse_one_photo()
     if detach and server is None:
         raise typer.BadParameter(
             "--detach needs --server: without a server, the job ends with this command.",
