@@ -1,13 +1,11 @@
 """The supervisor of the embedded service: starts its processes, restarts them, and stops them in order."""
 
-import http.client
 import importlib.util
 import json
 import os
 import selectors
 import signal
 import socket
-import ssl
 import sys
 import time
 from collections.abc import Callable
@@ -19,6 +17,7 @@ from splatmill.backplane.private_files import listen
 from splatmill_server.up import redis_server
 from splatmill_server.up.child import Child
 from splatmill_server.up.folder import DataFolder, UpError
+from splatmill_server.up.readiness import Readiness
 
 WORKER = "splatmill_worker"
 
@@ -56,7 +55,7 @@ class Supervisor:
             )
         self.folder = folder
         self.say = say
-        self._address = listener.getsockname()[:2]
+        self._readiness = Readiness(listener.getsockname()[:2])
         environment = dict(os.environ)
         environment |= {
             "SPLATMILL_DATA": str(folder.path),
@@ -133,6 +132,7 @@ class Supervisor:
                         return
         finally:
             waiting.close()
+            self._readiness.close()
             self._stop()
 
     def _listen_for_views(self) -> socket.socket:
@@ -181,36 +181,16 @@ class Supervisor:
 
     def _answers(self) -> bool:
         """Return whether the API reports that Redis and storage are available."""
-        return self._ask()[0] == 200
+        return self.api.running and self._readiness.ask()[0] == 200
 
     def _unready(self) -> str:
-        _, body = self._ask()
+        _, body = self._readiness.ask()
         try:
             checks = json.loads(body)["checks"]
         except (ValueError, KeyError, TypeError):
             return f"the API does not answer. The end of its log:\n{self.folder.log_end('api')}"
         wrong = "; ".join(f"{name}: {state}" for name, state in checks.items() if state != "ok")
         return f"{wrong}\nThe end of the log of the API:\n{self.folder.log_end('api')}"
-
-    def _ask(self) -> tuple[int, bytes]:
-        if not self.api.running:
-            return 0, b""
-        host, port = self._address
-        local = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
-        connection: http.client.HTTPConnection
-        if os.environ.get("SPLATMILL_TLS_CERTIFICATE"):
-            # The socket is our own, whatever names the certificate is for.
-            connection = http.client.HTTPSConnection(local, port, timeout=2, context=_unchecked())
-        else:
-            connection = http.client.HTTPConnection(local, port, timeout=2)
-        try:
-            connection.request("GET", "/readyz", headers={"Connection": "close"})
-            answer = connection.getresponse()
-            return answer.status, answer.read()
-        except OSError:
-            return 0, b""
-        finally:
-            connection.close()
 
     def _stop(self) -> None:
         """Stop all children. Redis is stopped last, because the worker needs it to hand its job back."""
@@ -228,11 +208,3 @@ class Supervisor:
             self._views.close()
             self.folder.renderer_socket.unlink(missing_ok=True)
         signal.set_wakeup_fd(-1)
-
-
-def _unchecked() -> ssl.SSLContext:
-    """Return a context for TLS that accepts any certificate."""
-    context = ssl.create_default_context()
-    context.check_hostname = False
-    context.verify_mode = ssl.CERT_NONE
-    return context

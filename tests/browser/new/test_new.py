@@ -18,7 +18,7 @@ from typing import Any
 
 import pytest
 from PIL import Image, ImageFilter
-from playwright.sync_api import Locator, Page, Request, expect
+from playwright.sync_api import Locator, Page, Request, Route, expect
 
 from splatmill.schema import MIN_PHOTOS, describe_options
 from splatmill_worker.images.panoramas.panoramas import by_edges, stated
@@ -231,6 +231,21 @@ def test_a_folder_with_cameras_is_dropped(visit: Visit, service: Up, tmp_path: P
     assert files["poses/transforms.json"] == digest(data_set / "transforms.json")
     assert files["images/00.png"] == digest(data_set / "images" / "00.png")
     assert len(files) == 15
+
+
+def test_what_is_dropped_before_the_page_is_ready_is_taken(visit: Visit) -> None:
+    held: list[Route] = []
+    visit.page.route("**/v1/me", lambda route: held.append(route))
+    visit.page.goto("/")
+    cancelled = visit.page.evaluate("""() => {
+        const data = new DataTransfer();
+        data.items.add(new File(["hello"], "notes.txt"));
+        return !document.body.dispatchEvent(
+            new DragEvent("drop", { dataTransfer: data, bubbles: true, cancelable: true }));
+    }""")
+    assert cancelled  # or the browser would leave the page for the file
+    held[0].continue_()
+    expect(visit.page.locator("#main")).to_contain_text("notes.txt")
 
 
 def test_a_killed_upload_sends_what_is_missing(visit: Visit, service: Up, tmp_path: Path, jobs: None) -> None:

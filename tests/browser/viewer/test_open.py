@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Page, Route, expect
 
 from tests.browser.conftest import SmallModel
 from tests.support.up import Up
@@ -58,3 +58,13 @@ def test_what_is_no_model_is_refused_by_name_and_the_next_file_is_shown(
     page.get_by_label("Choose a file").set_input_files(path)
     expect(page.get_by_role("heading", level=1)).to_have_text("good.ply", timeout=WAIT)
     expect(page.get_by_role("alert")).to_have_count(0)
+
+
+def test_a_file_that_is_dropped_before_the_page_knows_who_looks_is_taken(service: Up, page: Page) -> None:
+    held: list[Route] = []
+    page.route("**/v1/me", lambda route: held.append(route))
+    page.goto("/open")
+    page.evaluate(DROP, ["notes.txt", "hello"])
+    expect(page.get_by_role("alert")).to_have_text(re.compile(r"notes\.txt: .*68 65 6c 6c"), timeout=WAIT)
+    assert held
+    held[0].continue_()

@@ -39,6 +39,12 @@ let asked = "";
 /** The settings and files that the button was refused with: why it was stays shown until they are changed. */
 let refusedWith = "";
 
+/** Called once files can be taken. @type {() => void} */
+let canTake = () => {};
+/** @type {Promise<void>} */
+const takes = new Promise((resolve) => (canTake = resolve));
+wireDropping();
+
 const caller = await startShell();
 const [info, { options }] = await Promise.all([get("/v1/info"), get("/v1/options")]);
 const items = new Items(info.accepted, info.limits.max_image_pixels);
@@ -56,6 +62,7 @@ byId("phone").hidden = matchMedia("(pointer: coarse)").matches; // it is one
 
 wireGiving();
 wireTools();
+canTake();
 byId("form").addEventListener("submit", (event) => {
   event.preventDefault();
   void start.go();
@@ -83,8 +90,11 @@ function wireGiving() {
       field.value = "";
     });
   }
+}
+
+function wireDropping() {
   const zone = byId("drop");
-  // Files that miss the zone would replace the page.
+  // Files that miss the zone, or are dropped before the page is ready, would replace it.
   addEventListener("dragover", (event) => {
     event.preventDefault();
     zone.classList.add("over");
@@ -95,7 +105,9 @@ function wireGiving() {
     zone.classList.remove("over");
     if (!event.dataTransfer) return;
     try {
-      await take(await dropped(event.dataTransfer));
+      const files = dropped(event.dataTransfer); // at once: the browser empties it after the event
+      await takes;
+      await take(await files);
     } catch (error) {
       notify(/** @type {Error} */ (error));
     }

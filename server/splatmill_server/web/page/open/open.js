@@ -10,7 +10,6 @@ let view = null;
 /** The number of files so far: one that was chosen while another was read is the one that is shown. */
 let chosen = 0;
 
-await startShell({ open: true, viewer: true });
 const box = byId("view");
 const field = /** @type {HTMLInputElement} */ (byId("file"));
 const take = () => {
@@ -28,6 +27,7 @@ addEventListener("drop", (event) => {
   event.preventDefault();
   void show(file);
 });
+await startShell({ open: true, viewer: true }); // last: a file may be dropped while it asks who is there
 
 /** @param {File} file */
 async function show(file) {
