@@ -293,7 +293,9 @@ def _cameras() -> list[str]:
 def _undistorted(model: str) -> str:
     if model == PANORAMA:
         return "cut into the faces of a cube"
-    return "as they are" if model in PINHOLE_MODELS else "undistorted to a pinhole"
+    if model in PINHOLE_MODELS:
+        return "as they are"
+    return "undistorted to a pinhole, or to faces" if "FISHEYE" in model else "undistorted to a pinhole"
 
 
 def _points() -> list[str]:

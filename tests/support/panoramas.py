@@ -92,9 +92,42 @@ def panorama(scene: StillLife, viewmat: np.ndarray, width: int, samples: int = 2
         ),
         axis=-1,
     )
+    return seen_along(scene, viewmat, rays, width // 2, samples)
+
+
+def fisheye(
+    scene: StillLife,
+    viewmat: np.ndarray,
+    size: tuple[int, int],
+    focal: float,
+    degrees: float,
+    samples: int = 2,
+) -> np.ndarray:
+    """The photo uint8 [H,W,3] of an equidistant lens in the middle of the photo, black beyond its angle of view.
+
+    size: width and height. focal: pixels per radian.
+    """
+    width, height = size
+    x, y = np.meshgrid(
+        (np.arange(width) + 0.5 - width / 2) / focal, (np.arange(height) + 0.5 - height / 2) / focal
+    )
+    angle = np.hypot(x, y)
+    across = np.sinc(angle / np.pi)
+    rays = np.stack([x * across, y * across, np.cos(angle)], axis=-1)
+    photo = seen_along(scene, viewmat, rays, round(focal * np.pi / 2 * 1.3), samples)
+    photo[angle > np.radians(degrees) / 2] = 0
+    return photo
+
+
+def seen_along(
+    scene: StillLife, viewmat: np.ndarray, rays: np.ndarray, side: int, samples: int
+) -> np.ndarray:
+    """What a camera sees along rays [H,W,3] of its frame, uint8 [H,W,3], looked up in the faces of a cube.
+
+    side: pixels of a face.
+    """
     largest = np.abs(rays).argmax(axis=-1)
-    side = width // 2  # twice the pixels of the panorama along the middle of a face
-    result = np.zeros((width // 2, width, 3), np.uint8)
+    result = np.zeros(rays.shape, np.uint8)
     for (axis, sign), axes in CUBE.items():
         rows = (largest == axis) & (rays[..., axis] * sign > 0)
         rotation = np.array(axes, np.float64)

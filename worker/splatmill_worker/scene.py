@@ -6,6 +6,7 @@ Cameras follow OpenCV: x right, y down, z forward, world-to-camera matrices, and
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -43,12 +44,14 @@ class Lens:
     model: COLMAP's name of the camera model.
     params: COLMAP's parameters of that model, lengths in pixels (OPENCV: fx, fy, cx, cy, k1, k2, p1, p2).
     width, height: size in pixels of the photo that the parameters refer to.
+    limit: angle from the axis in radians up to which the photo shows something, where its picture is round.
     """
 
     model: str
     params: tuple[float, ...]
     width: int
     height: int
+    limit: float = math.inf
 
 
 class Projection(NamedTuple):
@@ -177,15 +180,15 @@ def looked_at(centers: Float, axes: Float, ridge: float = 1e-3, weights: Float |
 
 @dataclass(frozen=True)
 class Face:
-    """The part of a panorama that a view shows.
+    """The part of a panorama, or of a photo of a wide lens, that a view shows.
 
-    panorama: name of the panorama.
-    width: of the panorama in pixels; it is half as high.
-    rotation: from the panorama's frame (x right, y down, z towards its middle) to the view's camera, [3,3].
+    photo: name of the photo.
+    lens: projection of the photo.
+    rotation: from the photo's frame (x right, y down, z towards its middle) to the view's camera, [3,3].
     """
 
-    panorama: str
-    width: int
+    photo: str
+    lens: Lens
     rotation: Float
 
 
@@ -206,7 +209,7 @@ class View:
     upright: whether the camera describes the photo with its EXIF orientation applied.
     other: the view with the other `upright`, where the camera fits the photo both ways; None: it is decided.
     shown_from: level of the mask, 0 to 255, from which a pixel is shown.
-    face: which part of the photo and of its mask the view shows, where that is a panorama; None: all of it.
+    face: which part of the photo and of its mask the view shows, where several views share it; None: all of it.
     depth: path of its depth map, where the file with the cameras names one.
     """
 
@@ -224,8 +227,8 @@ class View:
 
     @property
     def photo(self) -> str:
-        """Name of the photo: of a face, that of the panorama."""
-        return self.name if self.face is None else self.face.panorama
+        """Name of the photo, which faces share."""
+        return self.name if self.face is None else self.face.photo
 
 
 class PointViews(NamedTuple):

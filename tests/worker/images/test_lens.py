@@ -79,7 +79,7 @@ def test_a_pixel_of_the_undistorted_photo_is_where_the_lens_puts_its_ray(
     camera = lens.pinhole(own, np.eye(4))
     u, v = (grid.ravel() for grid in np.meshgrid(np.linspace(0, W, 41), np.linspace(0, H, 31)))
     x, y = camera.normalized(u, v)
-    pixels = lens.distort(own, np.stack([x, y], axis=1))
+    pixels = lens.distort(own, np.stack([x, y, np.ones_like(x)], axis=1))
     seen = pixels[:, 0] > lens.NOWHERE / 2
     assert seen.mean() > 0.9
     bent_x, bent_y = equations(x[seen], y[seen], *extra)
@@ -139,8 +139,8 @@ def test_a_small_image_circle_is_not_left(tmp_path: Path) -> None:
     ],
 )
 def test_what_lies_beyond_the_fold_of_a_polynomial_is_masked(tmp_path: Path, own: Lens, limit: float) -> None:
-    assert lens.sight(own) == pytest.approx(limit, rel=2e-3)
-    assert lens.sight(own) <= limit
+    assert math.tan(lens.sight(own)) == pytest.approx(limit, rel=4e-3)
+    assert math.tan(lens.sight(own)) <= limit
     Image.new("RGB", (W, H), (200, 200, 200)).save(tmp_path / "a.png")
     view = View("a.png", lens.pinhole(own, np.eye(4)), tmp_path / "a.png", lens=own)
     photo = load_view(view, W)
@@ -152,11 +152,46 @@ def test_what_lies_beyond_the_fold_of_a_polynomial_is_masked(tmp_path: Path, own
     folded = float(length.max()) > limit
     assert (photo.mask is not None) == folded
     assert any("hold up to" in each for each in lens.remarks([own])) == folded
-    inside = lens.distort(own, np.stack(photo.camera.normalized(u.ravel(), v.ravel()), axis=1)).reshape(
-        H, W, 2
-    )
+    x, y = photo.camera.normalized(u.ravel(), v.ravel())
+    inside = lens.distort(own, np.stack([x, y, np.ones_like(x)], axis=1)).reshape(H, W, 2)
     covered = ((inside > 1.0) & (inside < (W - 1.0, H - 1.0))).all(axis=2)
-    assert shown[covered & (length < lens.sight(own) - pixel)].all()
+    assert shown[covered & (length < math.tan(lens.sight(own)) - pixel)].all()
+
+
+BEHIND = [
+    Lens("SIMPLE_FISHEYE", (110.0, 243.0, 178.0), W, H),
+    Lens("FISHEYE", (110.0, 112.0, 243.0, 178.0), W, H),
+    Lens("SIMPLE_RADIAL_FISHEYE", (110.0, 243.0, 178.0, 0.03), W, H),
+    *(glass(model, focal, extra) for model, focal, extra, _ in LENSES if model.endswith("_FISHEYE")),
+]
+
+
+@pytest.mark.parametrize("own", BEHIND, ids=lambda own: own.model)
+def test_rays_aside_and_behind_meet_an_equidistant_lens_by_the_equations_of_those_ahead(
+    own: Lens, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The module's own equations give COLMAP's pixels for rays ahead, and go on from them without a step."""
+    assert own.model in lens.EQUIDISTANT_MODELS
+    camera = lens.colmap_camera(own)
+    turn = np.random.default_rng(0).uniform(0.0, 2.0 * math.pi, 200)
+
+    def rays(angle: float) -> np.ndarray:
+        across = math.sin(angle) * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+        return np.concatenate([across, np.full((200, 1), math.cos(angle))], axis=1) * 3.0
+
+    ahead = {angle: lens.meet(camera, rays(angle)) for angle in (0.01, 0.5, 1.2, 1.55)}
+    steps = [lens.meet(camera, rays(angle)) for angle in np.linspace(1.5, 1.7, 201)]
+    assert np.abs(np.diff(steps, n=2, axis=0)).max() < 1e-3
+    assert np.linalg.norm(np.diff(steps, axis=0), axis=2).min() > 0.0
+    monkeypatch.setattr(lens, "ASIDE", math.inf)
+    for angle, pixels in ahead.items():
+        np.testing.assert_allclose(lens.meet(camera, rays(angle)), pixels, atol=1e-9)
+
+
+def test_only_equidistant_lenses_see_behind() -> None:
+    behind = np.array([[1.0, 0.5, -0.2]])
+    for own in (glass("FOV", (200.0, 201.0), (1.2,)), glass("OPENCV", (210.0, 211.0), (0.0, 0.0, 0.0, 0.0))):
+        assert (lens.distort(own, behind) == lens.NOWHERE).all()
 
 
 @pytest.mark.parametrize(

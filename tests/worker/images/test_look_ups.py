@@ -14,7 +14,7 @@ from splatmill_worker.images import look_ups
 from splatmill_worker.images.load import load_views
 from splatmill_worker.scene import Camera, Lens, View
 
-INTRINSICS = 50.0, 50.0, 32.0, 24.0
+CAMERA = Camera(64, 48, 50.0, 50.0, 32.0, 24.0, np.eye(4))
 
 
 def lens(number: int) -> Lens:
@@ -30,21 +30,21 @@ def test_a_lens_for_each_photo_stays_within_the_bound(monkeypatch: pytest.Monkey
     of_one = 2 * 2 * 64 * 48 * 8 + 64 * 48
     monkeypatch.setattr(look_ups, "KEPT_BYTES", 3 * of_one)
     for number in range(20):
-        look_ups.of(lens(number), INTRINSICS, 64, 48, 2)
+        look_ups.of(lens(number), CAMERA, 2)
         assert look_ups.kept_bytes() == min(number + 1, 3) * of_one
-    again = look_ups.of(lens(18), INTRINSICS, 64, 48, 2)
-    assert look_ups.of(lens(18), INTRINSICS, 64, 48, 2) is again  # the one used last is kept
+    again = look_ups.of(lens(18), CAMERA, 2)
+    assert look_ups.of(lens(18), CAMERA, 2) is again  # the one used last is kept
     monkeypatch.setattr(look_ups, "KEPT_BYTES", of_one // 2)
-    assert look_ups.of(lens(30), INTRINSICS, 64, 48, 2) is look_ups.of(lens(30), INTRINSICS, 64, 48, 2)
+    assert look_ups.of(lens(30), CAMERA, 2) is look_ups.of(lens(30), CAMERA, 2)
     assert look_ups.kept_bytes() == of_one  # one that is larger than the bound, alone
 
 
 @pytest.mark.parametrize("band", [1, 700, 10**6])
 def test_positions_do_not_depend_on_the_size_of_a_band(band: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = look_ups.of(lens(40), INTRINSICS, 64, 48, 3)
+    whole = look_ups.of(lens(40), CAMERA, 3)
     look_ups.forget()
     monkeypatch.setattr(look_ups, "BAND", band)
-    grid, seen = look_ups.of(lens(40), INTRINSICS, 64, 48, 3)
+    grid, seen = look_ups.of(lens(40), CAMERA, 3)
     np.testing.assert_array_equal(grid, whole[0])
     np.testing.assert_array_equal(seen, whole[1])
     assert 0 < int(seen.sum()) < seen.numel()
@@ -55,8 +55,7 @@ def test_positions_do_not_depend_on_the_size_of_a_band(band: int, monkeypatch: p
 def test_nothing_is_kept_once_the_photos_are_loaded(tmp_path: Path) -> None:
     path = tmp_path / "a.png"
     Image.new("RGB", (64, 48), (90, 120, 30)).save(path)
-    camera = Camera(64, 48, *INTRINSICS, np.eye(4))
-    views = [View(f"{number}.png", camera, path, lens=lens(number)) for number in range(1, 4)]
+    views = [View(f"{number}.png", CAMERA, path, lens=lens(number)) for number in range(1, 4)]
     photos = load_views(views, 64, threads=2)
     assert [photo.rgb.shape for photo in photos] == [(48, 64, 3)] * 3
     assert look_ups.kept_bytes() == 0

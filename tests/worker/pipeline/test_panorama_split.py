@@ -45,7 +45,7 @@ def names(views: tuple[View, ...]) -> list[str]:
 
 def beside(view: View, path: Path, shift: float, degrees: float) -> View:
     """A panorama moved along x, and turned about its vertical, with a picture of its own."""
-    whole = faces.panorama_of(view)
+    whole = faces.whole_of(view)
     angle = np.radians(degrees)
     turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
     camera = replace(

@@ -5,8 +5,10 @@ Does not prove that the shared focal length converges; `test_reconstruct` compar
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
+from splatmill_worker.images.image_circle import Circle
 from splatmill_worker.sfm import cameras
 from tests.support.scenes.photos import usable
 
@@ -32,3 +34,23 @@ def test_photos_with_exif_share_a_camera_across_folders() -> None:
     tags = {"make": "A", "model": "B", "focal_in_diagonals": 0.6}
     groups = cameras.group([usable(f"{number}/photo.jpg", **tags) for number in range(8)])
     assert [group.photos for group in groups] == [tuple(range(8))]
+
+
+def test_fisheyes_have_cameras_of_their_own() -> None:
+    circle = Circle(0.52, 0.5, 0.4)
+    phone = {"make": "A", "model": "B", "focal_in_diagonals": 0.6}
+    plain, named = usable("1", **phone), usable("2", lens="8mm Fish-Eye", **phone)
+    round_ones = [replace(usable(name, **phone), circle=circle) for name in ("3", "4")]
+    groups = cameras.group([plain, named, *round_ones])
+    assert [(group.photos, group.is_fisheye) for group in groups] == [
+        ((0,), False),
+        ((1,), True),
+        ((2, 3), True),
+    ]
+    assert groups[1].focal == pytest.approx(400 / 640 / (np.pi / 2))
+    assert groups[1].center == (0.5, 0.5)
+    assert groups[2].focal == pytest.approx(0.4 / (np.pi / 2))
+    assert groups[2].center == (0.52, 0.5)
+    ordinary = cameras.as_pinholes(groups)
+    assert ordinary[0] is groups[0]
+    assert {(group.focal, group.known, group.is_fisheye) for group in ordinary[1:]} == {(1.2, False, False)}

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable
+from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -16,6 +17,7 @@ import numpy.typing as npt
 
 from splatmill.schema.quantities import counted
 from splatmill_worker.colmap import pycolmap
+from splatmill_worker.images.image_circle import EDGE, Circle
 from splatmill_worker.scene import Camera, Lens
 
 Float = npt.NDArray[np.float64]
@@ -25,6 +27,16 @@ PANORAMA = "EQUIRECTANGULAR"
 
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE")
 """COLMAP's camera models without distortion."""
+
+EQUIDISTANT_MODELS = (
+    "SIMPLE_FISHEYE",
+    "FISHEYE",
+    "SIMPLE_RADIAL_FISHEYE",
+    "RADIAL_FISHEYE",
+    "OPENCV_FISHEYE",
+    "THIN_PRISM_FISHEYE",
+)
+"""COLMAP's camera models whose equations hold for what lies behind the camera, too."""
 
 POLYNOMIAL_MODELS = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 """COLMAP's camera models that are a pinhole when all distortion coefficients are zero; fisheye models are not."""
@@ -39,11 +51,18 @@ cos^2, 2.4 times: wider, its middle is coarse, and a Gaussian is no ellipse, as 
 SIGHT_DIRECTIONS, SIGHT_STEPS = 32, 2000
 """Directions from the optical axis, and steps along each, in which the limit of what a lens sees is searched for."""
 
+_TURNS = np.linspace(0.0, 2.0 * math.pi, SIGHT_DIRECTIONS, endpoint=False)
+DIRECTIONS = np.stack([np.cos(_TURNS), np.sin(_TURNS)], axis=1)
+"""These directions, [SIGHT_DIRECTIONS,2]."""
+
 BORDER_SAMPLES = 64
 """Points on each side of the undistorted photo that must lie within the photo."""
 
 ZOOM_STEPS = 800
 """Zooms tried between the bounds, 0.2 % apart."""
+
+ASIDE = 0.01
+"""Share of a ray's length across the axis up to which it counts as going aside or back: COLMAP divides by it."""
 
 NOWHERE = -1e6
 """Pixel position of a ray that the lens does not see, far outside any photo."""
@@ -69,6 +88,11 @@ def pinhole(lens: Lens, viewmat: npt.NDArray[np.float64]) -> Camera:
     return Camera(lens.width, lens.height, plain.fx * zoom, plain.fy * zoom, plain.cx, plain.cy, viewmat)
 
 
+def is_cut(lens: Lens) -> bool:
+    """Whether the lens sees more than its pinhole camera shows."""
+    return lens.model != PANORAMA and _zoom_of(lens).cut
+
+
 class _Zoom(NamedTuple):
     """The focal length of the undistorted photo over the photo's, and whether the lens sees more than it shows."""
 
@@ -84,7 +108,7 @@ def _zoom_of(lens: Lens) -> _Zoom:
 
     def reach(zoom: float) -> tuple[bool, float]:
         """Whether the border at this zoom lies within the photo, and its largest distance from the principal point."""
-        seen = distort(lens, rays / zoom)
+        seen = distort(lens, _ahead(rays / zoom))
         low, high = seen.min(axis=0), seen.max(axis=0)
         # Up to half a pixel beyond the border, the nearest pixel is still one of the border.
         inside = bool(low.min() >= -0.5 and high[0] <= lens.width + 0.5 and high[1] <= lens.height + 0.5)
@@ -125,30 +149,55 @@ def _least_zoom(lens: Lens) -> float:
 
 @lru_cache(maxsize=4096)
 def sight(lens: Lens) -> float:
-    """The length of (x, y) up to which the lens sees rays (x, y, 1); infinite where that is all of the photo.
+    """The angle from the axis, in radians, up to which the lens sees; infinite where its equations hold everywhere.
 
     Away from the axis, rays meet the photo farther and farther from the principal point. Where they do so no longer,
     the equations of the lens hold no more: a polynomial folds back, and would show again what is nearer to the axis.
     """
     camera = colmap_camera(lens)
     middle = np.array([camera.principal_point_x, camera.principal_point_y])
-    farthest = float(np.linalg.norm(_border_rays(lens), axis=1).max()) / _least_zoom(lens)
-    lengths = np.linspace(0.0, farthest, SIGHT_STEPS + 1)[1:]
-    angles = np.linspace(0.0, 2.0 * math.pi, SIGHT_DIRECTIONS, endpoint=False)
-    directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    rays = lengths[:, None, None] * directions
+    sees_behind = lens.model in EQUIDISTANT_MODELS
+    most = math.pi if sees_behind else math.atan(_farthest(lens))
+    angles = np.linspace(0.0, most, SIGHT_STEPS + 1)[1:]
     # In units of the focal lengths, a lens puts a ray about in its own direction.
-    bent = (_meet(camera, rays.reshape(-1, 2)) - middle) / (camera.focal_length_x, camera.focal_length_y)
-    away = (bent.reshape(rays.shape) * directions).sum(axis=2)
+    bent = (_meet_all_round(camera, angles) - middle) / (camera.focal_length_x, camera.focal_length_y)
+    away = (bent * DIRECTIONS).sum(axis=2)
     grows = (np.diff(away, axis=0, prepend=0.0) > 0.0).all(axis=1)
     folded = np.flatnonzero(~grows)
-    # The largest distance lies at most a step before the last that grew.
-    return (float(lengths[folded[0] - 2]) if folded[0] > 1 else 0.0) if len(folded) else math.inf
+    if len(folded):
+        # The largest distance lies at most a step before the last that grew.
+        return float(angles[folded[0] - 2]) if folded[0] > 1 else 0.0
+    return math.inf
+
+
+def within(lens: Lens, circle: Circle) -> Lens:
+    """The lens with the limit that a round picture sets; itself where that is none of a fisheye."""
+    if lens.model == PANORAMA or lens.model in POLYNOMIAL_MODELS:
+        return lens
+    camera = colmap_camera(lens)
+    middle = circle.x * lens.width, circle.y * lens.height
+    radius = (1.0 - EDGE) * circle.radius * max(lens.width, lens.height)
+    angles = np.linspace(0.0, min(sight(lens), math.pi), SIGHT_STEPS + 1)[1:-1]
+    distances = np.linalg.norm(_meet_all_round(camera, angles) - middle, axis=2)
+    beyond = np.flatnonzero(~(distances <= radius).any(axis=1))
+    return replace(lens, limit=float(angles[beyond[0]])) if len(beyond) else lens
+
+
+def _meet_all_round(camera: pycolmap.Camera, angles: Float) -> Float:
+    """Pixel positions [n,SIGHT_DIRECTIONS,2] of rays at `angles` [n] from the axis, in all DIRECTIONS."""
+    across = np.sin(angles)[:, None, None] * DIRECTIONS
+    along = np.broadcast_to(np.cos(angles)[:, None, None], (*across.shape[:2], 1))
+    return meet(camera, np.concatenate([across, along], axis=2).reshape(-1, 3)).reshape(across.shape)
+
+
+def _farthest(lens: Lens) -> float:
+    """The tangent of the angle from the axis to the farthest corner of the widest undistorted photo."""
+    return float(np.linalg.norm(_border_rays(lens), axis=1).max()) / _least_zoom(lens)
 
 
 def remarks(lenses: Iterable[Lens | None]) -> list[str]:
     """Warnings for the user about the photos with these lenses, where the undistorted ones do not show all that a lens
-    sees, or show more; the figures are those of the most common lens."""
+    sees, or show more; the figures are those of the most common lens. None of them is divided into faces."""
     counts = Counter(lens for lens in lenses if lens is not None and lens.model != PANORAMA)
     said = []
     wide = Counter({lens: count for lens, count in counts.items() if _zoom_of(lens).cut})
@@ -159,10 +208,13 @@ def remarks(lenses: Iterable[Lens | None]) -> list[str]:
             f"The lens of {_counted(wide)} sees more than a pinhole camera can show. The middle is trained on, "
             f"{across[0]:.0f} by {across[1]:.0f} degrees, and the rest of the photos is not used."
         )
-    corner = {lens: np.linalg.norm(_border_rays(lens), axis=1).max() / _zoom_of(lens).zoom for lens in counts}
+    corner = {
+        lens: math.atan(np.linalg.norm(_border_rays(lens), axis=1).max() / _zoom_of(lens).zoom)
+        for lens in counts
+    }
     folded = Counter({lens: count for lens, count in counts.items() if corner[lens] > sight(lens)})
     if folded:
-        angle = math.degrees(math.atan(sight(folded.most_common(1)[0][0])))
+        angle = math.degrees(sight(folded.most_common(1)[0][0]))
         said.append(
             f"The equations of the lens of {_counted(folded)} hold up to {angle:.0f} degrees from its axis. What lies "
             "beyond in the photos is not used."
@@ -182,7 +234,7 @@ def distortion(lens: Lens) -> float:
     corner = np.array([[0.0, 0.0], [lens.width, 0.0], [0.0, lens.height], [lens.width, lens.height]])
     frame = np.concatenate([corner, (corner + corner[[1, 3, 0, 2]]) / 2])
     rays = np.stack(without_distortion(camera).normalized(frame[:, 0], frame[:, 1]), axis=1)
-    seen = _meet(camera, rays)
+    seen = meet(camera, _ahead(rays))
     return float(np.linalg.norm(np.where(np.isfinite(seen), seen, NOWHERE) - frame, axis=1).max())
 
 
@@ -211,16 +263,53 @@ def colmap_camera(lens: Lens) -> pycolmap.Camera:
 
 
 def distort(lens: Lens, rays: Float) -> Float:
-    """Pixel positions [n,2] on the distorted photo of rays (x, y, 1), given as [n,2].
+    """Pixel positions [n,2] on the distorted photo of rays [n,3] in the camera's frame, of any length.
 
     Rays that the lens does not see are put at NOWHERE.
     """
-    pixels = _meet(colmap_camera(lens), rays)
-    pixels[np.linalg.norm(rays, axis=1) > sight(lens)] = NOWHERE
+    pixels = meet(colmap_camera(lens), rays)
+    angles = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
+    pixels[angles > min(sight(lens), lens.limit)] = NOWHERE
     return np.where(np.isfinite(pixels), pixels, NOWHERE)
 
 
-def _meet(camera: pycolmap.Camera, rays: Float) -> Float:
-    """Pixel positions [n,2] of rays (x, y, 1), given as [n,2], by the equations of the lens; they may not be finite."""
-    ahead = np.concatenate([rays, np.ones((len(rays), 1))], axis=1)
-    return np.array(camera.img_from_cam(ahead), np.float64)
+def _ahead(rays: Float) -> Float:
+    """The rays (x, y, 1) [n,3] of (x, y), given as [n,2]."""
+    return np.concatenate([rays, np.ones((len(rays), 1))], axis=1)
+
+
+def meet(camera: pycolmap.Camera, rays: Float) -> Float:
+    """Pixel positions [n,2] of rays [n,3], by the equations of the lens; they may not be finite.
+
+    COLMAP puts rays only that go ahead; where a lens is equidistant, the others are put by its equations as well.
+    """
+    pixels = np.array(camera.img_from_cam(rays), np.float64).reshape(-1, 2)
+    aside = rays[:, 2] <= ASIDE * np.hypot(rays[:, 0], rays[:, 1])
+    if camera.model.name in EQUIDISTANT_MODELS and aside.any():
+        pixels[aside] = _meet_equidistant(camera, rays[aside])
+    return pixels
+
+
+def _meet_equidistant(camera: pycolmap.Camera, rays: Float) -> Float:
+    """Pixel positions [n,2] of rays [n,3] on an equidistant lens: the angle from the axis, in the direction of the ray,
+    then its distortion (COLMAP, src/colmap/sensor/models.h)."""
+    radius = np.hypot(rays[:, 0], rays[:, 1])
+    with np.errstate(invalid="ignore"):  # straight behind is no direction
+        bent = rays[:, :2] * (np.arctan2(radius, rays[:, 2]) / radius)[:, None]
+    params = np.asarray(camera.params, np.float64)
+    extra = params[camera.extra_params_idxs()].tolist()
+    square = np.square(bent).sum(axis=1)
+    moved = bent.copy()
+    tangential: list[float] = []
+    if camera.model.name == "THIN_PRISM_FISHEYE":
+        extra, tangential = [extra[index] for index in (0, 1, 4, 5)], [extra[index] for index in (2, 3, 6, 7)]
+    moved += (
+        bent * sum(value * square**order for order, value in enumerate(extra, 1))[:, None] if extra else 0.0
+    )
+    if tangential:
+        p1, p2, s1, s2 = tangential
+        u, v = bent.T
+        moved[:, 0] += 2.0 * p1 * u * v + p2 * (square + 2.0 * u * u) + s1 * square
+        moved[:, 1] += 2.0 * p2 * u * v + p1 * (square + 2.0 * v * v) + s2 * square
+    focal = camera.focal_length_x, camera.focal_length_y
+    return np.asarray(moved * focal + (camera.principal_point_x, camera.principal_point_y))

@@ -20,7 +20,7 @@ from splatmill_worker.images import look_ups
 from splatmill_worker.images.decode import Pixels
 from splatmill_worker.images.decoding.decoders import decode
 from splatmill_worker.images.masks import shown_part
-from splatmill_worker.images.panoramas import decoded_panoramas, faces
+from splatmill_worker.images.panoramas import divided_photos, faces
 from splatmill_worker.images.pixel_files import PixelFiles
 from splatmill_worker.scene import MIN_SHOWN, Camera, Lens, View
 
@@ -89,7 +89,7 @@ def load_views(
             )
     finally:
         look_ups.forget()
-        decoded_panoramas.forget()
+        divided_photos.forget()
 
 
 class _Filed:
@@ -144,13 +144,12 @@ def load_view(
     full = view.camera
     width, height = training_size(full.width, full.height, longest_side)
     camera = full.scaled_to(width, height)
+    seen = None
     if view.face is not None:
-        size = faces.enough(camera)
+        size = faces.enough(view.face, camera)
         key = view.image, view.mask, view.shown_from, view.upright, size
-        panorama = decoded_panoramas.of(
-            key, lambda: faces.prepared(_layers(view, size), view.mask is None, size)
-        )
-        planes = faces.resampled(panorama, view.face, camera)
+        whole = divided_photos.of(key, lambda: faces.prepared(_layers(view, size), view.mask is None, size))
+        planes, seen = faces.resampled(whole, view.face, camera)
         has_alpha = len(planes) - (view.mask is not None) == 4
     else:
         # Undistortion interpolates a photo of at least twice the size, so that it does not blur.
@@ -160,12 +159,11 @@ def load_view(
         if has_alpha:
             # Premultiplied, so that averages take no colour from transparent pixels.
             planes[:3] *= planes[3:4] / 255.0
-    keep = None
     if view.lens is None:
         planes = _area(planes, width, height)
     else:
-        planes, seen = _undistort(planes, view.lens, full, width, height)
-        keep = None if bool(seen.all()) else seen
+        planes, seen = _undistort(planes, view.lens, camera)
+    keep = None if seen is None or bool(seen.all()) else seen
     if view.mask is not None:
         keep = planes[-1] >= MIN_COVER if keep is None else keep & (planes[-1] >= MIN_COVER)
     alpha = None
@@ -207,12 +205,13 @@ def _decode_for(view: View, enough: tuple[int, int]) -> Image.Image:
 def _check_shape(view: View, path: Path, size: tuple[int, int]) -> None:
     """Raise ValueError for a photo or mask whose aspect ratio differs from the camera's by more than rounding."""
     width, height = size
-    expected = view.camera.width / view.camera.height if view.face is None else 2.0
+    whole = view.camera if view.face is None else view.face.lens
+    expected = whole.width / whole.height
     # Reduced sizes are rounded to whole pixels, which changes the aspect ratio of small photos the most.
     if abs(width / height / expected - 1.0) > 0.02 + 2.0 / min(width, height):
         raise ValueError(
-            f"{path.name} has {width} x {height} pixels, a different shape from the {view.camera.width} x "
-            f"{view.camera.height} of its camera. Give the file that the camera was made for, not cropped or rotated."
+            f"{path.name} has {width} x {height} pixels, a different shape from the {whole.width} x "
+            f"{whole.height} of its camera. Give the file that the camera was made for, not cropped or rotated."
         )
 
 
@@ -242,24 +241,13 @@ def _area_weights(source: int, target: int) -> torch.Tensor:
     return torch.from_numpy(np.clip(overlap, 0.0, None) * (target / source)).float()
 
 
-def _undistort(
-    planes: torch.Tensor, lens: Lens, camera: Camera, width: int, height: int
-) -> tuple[torch.Tensor, torch.Tensor]:
+def _undistort(planes: torch.Tensor, lens: Lens, camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
     """Planes [C,h,w] of the photo as [C,height,width] of `camera`, and which pixels the photo covers [height,width]."""
+    width, height = camera.width, camera.height
     if planes.shape[2] > MAX_SAMPLES * width:
         planes = _area(planes, MAX_SAMPLES * width, MAX_SAMPLES * height)
     samples = max(1, min(MAX_SAMPLES, int(np.ceil(planes.shape[2] / width - 1e-6))))
-    pinhole = camera.scaled_to(width, height)
-    grid, seen = look_ups.of(lens, (pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy), width, height, samples)
-    taken = torch.nn.functional.grid_sample(
-        planes[None],
-        grid[None],
-        # With one look-up per pixel nothing is averaged afterwards, and bicubic interpolation blurs less.
-        mode="bilinear" if samples > 1 else "bicubic",
-        padding_mode="border",
-        align_corners=False,
-    )
-    return torch.nn.functional.avg_pool2d(taken, samples)[0].clamp(0.0, 255.0), seen
+    return look_ups.resampled(planes, lens, camera, samples)
 
 
 def _bytes(values: torch.Tensor) -> Pixels:

@@ -25,6 +25,7 @@ from splatmill_worker.images.archives import archive, unpacked_room
 from splatmill_worker.images.colors import photo_colors
 from splatmill_worker.images.copies import SmallPicture
 from splatmill_worker.images.decoding import decoders
+from splatmill_worker.images.image_circle import Circle
 from splatmill_worker.images.masks import masks_under, unfit
 from splatmill_worker.images.overlays import overlays
 from splatmill_worker.images.panoramas import panoramas
@@ -60,6 +61,7 @@ class UsablePhoto:
     colors: how its colours become sRGB, as `PhotoColors.remark` says it.
     sphere: what says that it is a panorama.
     is_panorama: whether it is taken for one, which shows 360 by 180 degrees.
+    circle: what a circular fisheye lens fills of it; None where it fills it all.
     alpha: its smallest and largest alpha.
     kind: what it seems to be, if no photo.
     """
@@ -77,6 +79,7 @@ class UsablePhoto:
     colors: str = ""
     sphere: panoramas.Sphere = ""
     is_panorama: bool = False
+    circle: Circle | None = None
     alpha: transparency.Extent = (255, 255)
     kind: no_photo.Kind = ""
 
@@ -254,8 +257,9 @@ def prepare(
             photo,
             mask=overlays.mask_file(mask, photo.mask, workdir, shown_from=photo.shown_from),
             shown_from=MIN_SHOWN,
+            circle=circle,
         )
-        for photo, mask in zip(ordered, hidden.regions, strict=True)
+        for photo, mask, circle in zip(ordered, hidden.regions, hidden.circles, strict=True)
     ]
     found.warnings += [*copies.warning(copied), *hidden.warnings]
     found.warnings += transparency.remarks({photo.name: photo.alpha for photo in ordered})

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
 
 from splatmill_worker.colmap import pycolmap
@@ -16,6 +17,15 @@ DEFAULT_FOCAL = 1.2
 
 LEAST_OF_A_FOLDER = 3
 """Photos without EXIF from which a folder has a camera of its own; fewer hardly determine its focal length."""
+
+MIN_FISHEYE_FOCAL = 0.1
+"""Least focal length of a fisheye over the longest side: a circle of 280 degrees that is as high as a photo of
+2 by 1."""
+
+HALF_FISHEYE = math.pi / 2.0
+"""Angle in radians from the axis of a fisheye lens to the border of its circle, or without one to the corners."""
+
+_FISHEYE = re.compile("fish.?eye", re.IGNORECASE)
 
 FOCAL_BOUNDS = 0.2, 9.0
 """Focal lengths over the longest side that lenses have: from an 8 mm fisheye to 300 mm on full frame."""
@@ -30,6 +40,9 @@ class CameraGroup:
     focal: initial focal length, over the longest side.
     known: whether EXIF gave the focal length.
     is_panorama: whether it shows 360 by 180 degrees, which has no focal length.
+    is_fisheye: whether its photos are of a fisheye lens; its focal length is then that of an equidistant one which sees
+        180 degrees, and stands for the angle between two pixels.
+    center: where its axis meets the photos, as shares of their width and height.
     """
 
     photos: tuple[int, ...]
@@ -38,6 +51,8 @@ class CameraGroup:
     focal: float
     known: bool
     is_panorama: bool = False
+    is_fisheye: bool = False
+    center: tuple[float, float] = (0.5, 0.5)
 
 
 def group(photos: Sequence[UsablePhoto]) -> list[CameraGroup]:
@@ -56,11 +71,24 @@ def group(photos: Sequence[UsablePhoto]) -> list[CameraGroup]:
     return [_group(tuple(members), photos[members[0]]) for members in groups.values()]
 
 
+def as_pinholes(groups: Sequence[CameraGroup]) -> list[CameraGroup]:
+    """The groups with an ordinary lens for each fisheye."""
+    return [
+        replace(group, focal=DEFAULT_FOCAL, known=False, is_fisheye=False, center=(0.5, 0.5))
+        if group.is_fisheye
+        else group
+        for group in groups
+    ]
+
+
 def _key(photo: UsablePhoto) -> tuple[object, ...]:
     """What photos of one camera agree in; last, the video or folder of a photo without EXIF of its camera."""
     if photo.is_panorama:
         return photo.width, photo.height, "panorama"
     tags = photo.exif
+    # A circle is that of all photos of its size in a folder.
+    if photo.circle is not None:
+        return photo.width, photo.height, photo.circle, "fisheye"
     camera = (tags.make, tags.model, tags.lens, tags.focal_length, tags.focal_in_diagonals)
     source = photo.sequence or PurePosixPath(photo.name).parent if camera == (None,) * len(camera) else None
     return photo.width, photo.height, *camera, source
@@ -69,6 +97,20 @@ def _key(photo: UsablePhoto) -> tuple[object, ...]:
 def _group(members: tuple[int, ...], photo: UsablePhoto) -> CameraGroup:
     if photo.is_panorama:
         return CameraGroup(members, photo.width, photo.height, 1.0 / (2.0 * math.pi), True, is_panorama=True)
+    if photo.circle is not None:
+        circle = photo.circle
+        return CameraGroup(
+            members,
+            photo.width,
+            photo.height,
+            circle.radius / HALF_FISHEYE,
+            True,
+            is_fisheye=True,
+            center=(circle.x, circle.y),
+        )
+    if _FISHEYE.search(photo.exif.lens or ""):
+        radius = math.hypot(photo.width, photo.height) / 2.0 / max(photo.width, photo.height)
+        return CameraGroup(members, photo.width, photo.height, radius / HALF_FISHEYE, True, is_fisheye=True)
     focal = _focal(photo)
     known = focal is not None and FOCAL_BOUNDS[0] <= focal <= FOCAL_BOUNDS[1]
     return CameraGroup(

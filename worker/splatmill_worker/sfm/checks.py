@@ -12,7 +12,7 @@ import numpy.typing as npt
 from splatmill.schema.files.photos import MIN_PHOTOS
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.errors import SfmFailed
-from splatmill_worker.sfm.cameras import FOCAL_BOUNDS
+from splatmill_worker.sfm.cameras import FOCAL_BOUNDS, MIN_FISHEYE_FOCAL
 from splatmill_worker.sfm.matching.pairs import Pair
 from splatmill_worker.sfm.matching.two_view import MIN_INLIERS, ROTATION_CONFIGURATIONS, TwoView
 
@@ -73,7 +73,8 @@ def implausible_intrinsics(model: pycolmap.Reconstruction) -> str | None:
         if camera.is_spherical():
             continue
         focal = camera.mean_focal_length() / max(camera.width, camera.height)
-        if not FOCAL_BOUNDS[0] <= focal <= FOCAL_BOUNDS[1]:
+        least = MIN_FISHEYE_FOCAL if camera.is_perspective_fisheye() else FOCAL_BOUNDS[0]
+        if not least <= focal <= FOCAL_BOUNDS[1]:
             return f"a focal length of {focal:.2f} times the photo's longest side"
         extra = np.asarray(camera.params)[camera.extra_params_idxs()]
         if len(extra) and not np.all(np.abs(extra[:2]) <= MAX_DISTORTION):

@@ -44,7 +44,7 @@ def solve_at(run: SfmRun, effort: Effort, earlier: EffortResult | None) -> Effor
         run.options.matcher,
         run.options.seed,
         run.camera_model,
-        [(group.photos, group.focal) for group in run.groups],
+        [(group.photos, group.focal, group.center, group.is_fisheye) for group in run.groups],
         sorted(retried or ()),
     )
     result = EffortResult(effort, FeatureStore(run.folder / f"{effort.name}-{key}"))

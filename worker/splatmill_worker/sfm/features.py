@@ -25,7 +25,7 @@ from splatmill_worker.images.prepare import UsablePhoto
 from splatmill_worker.scene import MIN_SHOWN
 from splatmill_worker.sfm.callbacks import OnProgress, stop_if, watched
 from splatmill_worker.sfm.cameras import CameraGroup
-from splatmill_worker.sfm.options import PANORAMA_FEATURES, PANORAMA_SIDE, Effort
+from splatmill_worker.sfm.options import FISHEYE, PANORAMA_FEATURES, PANORAMA_SIDE, Effort
 
 MAX_IMAGES = 2147483647
 """COLMAP's kMaxNumImages: it numbers the pair of images a < b as MAX_IMAGES * a + b."""
@@ -114,7 +114,9 @@ def extract(
     with ThreadPoolExecutor(threads) as pool:
         for group in groups:
             missing = [index for index in group.photos if names[index] not in extracted]
-            reader.camera_model = PANORAMA if group.is_panorama else camera_model
+            reader.camera_model = (
+                PANORAMA if group.is_panorama else FISHEYE if group.is_fisheye else camera_model
+            )
             options.sift.max_num_features = effort.features * (PANORAMA_FEATURES if group.is_panorama else 1)
             side = round(effort.side * (PANORAMA_SIDE if group.is_panorama else 1.0))
             while missing:
@@ -264,10 +266,12 @@ def _set_cameras(groups: Sequence[CameraGroup], names: dict[int, str], path: Pat
             camera = database.read_camera(image.camera_id)
             params = np.array(camera.params)
             params[camera.focal_length_idxs()] = group.focal * max(camera.width, camera.height)
+            params[camera.principal_point_idxs()] = np.multiply(group.center, (camera.width, camera.height))
             camera.params = params.tolist()
             # EXIF initialises the focal length but is not used to verify matches: with a cropped photo or a wrong
-            # tag, the correct ones would fail (decisions: EXIF_FOCAL).
-            camera.has_prior_focal_length = False
+            # tag, the correct ones would fail (decisions: EXIF_FOCAL). No fundamental matrix fits photos of a fisheye,
+            # whose focal length is verified with.
+            camera.has_prior_focal_length = group.is_fisheye
             database.update_camera(camera)
     finally:
         database.close()

@@ -111,6 +111,7 @@ def _adjusted(
             model, run.threads, fixed_intrinsics=fixed, cancelled=run.cancelled, on_iterations=report
         )
         return model, ()
+    adjust.use_opencv_fisheye(model)
     group_of = {index: group for group in run.groups for index in group.photos}
     groups = {
         model.images[image_id].camera_id: group_of[features.photo_index(model.images[image_id].name)]
@@ -119,7 +120,7 @@ def _adjusted(
     initial = {
         camera_id: group.focal * max(model.cameras[camera_id].width, model.cameras[camera_id].height)
         for camera_id, group in groups.items()
-        if not group.is_panorama
+        if not group.is_panorama and not group.is_fisheye
     }
     if not initial:
         adjust.bundle_adjust(model, run.threads, cancelled=run.cancelled, on_iterations=report)

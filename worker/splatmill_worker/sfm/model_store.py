@@ -11,6 +11,7 @@ from typing import Any
 from splatmill.schema import KnownDistance, ModelFrame
 from splatmill_worker.colmap import pycolmap, write_model
 from splatmill_worker.images.lens import remarks
+from splatmill_worker.images.overlays import overlays
 from splatmill_worker.images.panoramas import faces
 from splatmill_worker.images.prepare import Prepared
 from splatmill_worker.scene import Scene, View
@@ -83,7 +84,11 @@ def load_model(prepared: Prepared, folder: Path, known: KnownDistance | None = N
     scene = replace(
         scene,
         facts=document["facts"],
-        warnings=(*prepared.warnings, *document["warnings"], *remarks(view.lens for view in scene.views)),
+        warnings=(
+            *prepared.warnings,
+            *document["warnings"],
+            *remarks(view.lens for view in scene.views if not faces.is_divided(view)),
+        ),
         overlays=prepared.overlays,
     )
     scene = faces.cut(scene)
@@ -100,7 +105,6 @@ def _views(prepared: Prepared, model: pycolmap.Reconstruction) -> dict[int, View
         photo = prepared.photos[index]
         view = posed_view(model, by_photo[index], photo.name, photo.path, photo.mask)
         camera = view.camera.scaled_to(photo.width, photo.height)
-        views[by_photo[index]] = replace(
-            view, camera=camera, shown_from=photo.shown_from, upright=True, other=None
-        )
+        view = replace(view, camera=camera, shown_from=photo.shown_from, upright=True, other=None)
+        views[by_photo[index]] = overlays.within_circle(view, photo.circle)
     return views

@@ -66,6 +66,9 @@ EFFORTS = {effort.name: effort for effort in (LEAN, STANDARD, HIGH)}
 NEXT_EFFORT = 3.0
 """Time of an effort over that of all before it: STANDARD's features take four times those of LEAN, and mapping less."""
 
+FISHEYE = "SIMPLE_RADIAL_FISHEYE"
+"""COLMAP's camera model by which photos of a fisheye lens are mapped."""
+
 PANORAMA_SIDE = 3.0
 """Longest side of a panorama that features are found on, over that of other photos: its pixels are then of the size of
 those of a photo that shows 120 degrees across."""

@@ -23,7 +23,7 @@ from splatmill_worker.sfm.matching.two_view import MIN_INLIERS, TwoView
 from splatmill_worker.sfm.options import Effort, SfmOptions
 from splatmill_worker.sfm.placed import PlacingObserver, placed
 
-VERSION = 7
+VERSION = 8
 """Version of everything that is cached; a cache with another version is not read."""
 
 UNFOLDED = "unfolded.db"

@@ -197,8 +197,28 @@ def _solve(run: SfmRun) -> EffortResult:
         if effort.name != LEAN.name and not result.verified:
             break  # the standard effort has about three times the lean one's features; even more would not match
     assert best is not None  # _efforts returns at least one
+    if best_counts[0] < ENOUGH_PLACED * run.count:
+        best = _without_fisheyes(run, best)
     unfold(run, best)
     return _with_divided_cameras(run, best)
+
+
+def _without_fisheyes(run: SfmRun, result: EffortResult) -> EffortResult:
+    """`result`, or the photos of fisheye lenses mapped again as those of ordinary ones, where that places more: a round
+    picture may be that of a microscope, and photos without distortion may still name their lens."""
+    fisheyes = run.groups
+    if not any(group.is_fisheye for group in fisheyes):
+        return result
+    run.groups = cameras.as_pinholes(fisheyes)
+    again = solve_at(run, result.effort, None)
+    if registered_counts(again.mapped) <= registered_counts(result.mapped):
+        run.groups = fisheyes
+        return result
+    run.notes.append(
+        f"As photos of a fisheye lens, {registered_counts(result.mapped)[0]} of {run.count} were placed reliably, and "
+        f"{registered_counts(again.mapped)[0]} as those of an ordinary lens, for which they are taken."
+    )
+    return again
 
 
 def _with_divided_cameras(run: SfmRun, result: EffortResult) -> EffortResult:

@@ -71,11 +71,11 @@ def unfold(run: SfmRun, result: EffortResult) -> None:
     `result.mapped` and `result.left_out` are changed where that leaves fewer contradictions and enough photos; a note
     says what was found either way. Raises Cancelled.
     """
-    # Panoramas show the surroundings, which differ where a thing looks alike from two sides.
+    # Panoramas and fisheyes show the surroundings, which differ where a thing looks alike from two sides.
     if (
         result.mapped is None
         or result.mapped.largest is None
-        or any(group.is_panorama for group in run.groups)
+        or any(group.is_panorama or group.is_fisheye for group in run.groups)
     ):
         return
     database = pycolmap.Database.open(result.store.database)

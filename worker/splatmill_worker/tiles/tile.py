@@ -15,7 +15,7 @@ from splatmill.schema import LogEvent, ProgressEvent
 from splatmill_worker import memory
 from splatmill_worker.images import look_ups
 from splatmill_worker.images.load import load_view, training_size
-from splatmill_worker.images.panoramas import decoded_panoramas
+from splatmill_worker.images.panoramas import divided_photos
 from splatmill_worker.images.pixel_files import PixelFiles
 from splatmill_worker.pipeline.cameras import Cameras
 from splatmill_worker.pipeline.job import Job
@@ -181,7 +181,7 @@ def _views(tile: Tile, members: Tensor) -> Iterator[TrainingView]:
             yield from pool.map(lambda each: _part_of(tile, each[0], each[1], size, files), some)
             tile.job.emit(ProgressEvent(stage="loading", done=first + len(some), total=len(chosen)))
     look_ups.forget()
-    decoded_panoramas.forget()
+    divided_photos.forget()
 
 
 def _part_of(tile: Tile, view: View, part: Part, size: int, files: PixelFiles | None) -> TrainingView:

@@ -1,4 +1,4 @@
-"""Hides what never moves in the photos of each camera (`overlay`), and says so."""
+"""Hides what never moves in the photos of each camera (`overlay`) and what lies round a round picture, and says so."""
 
 from __future__ import annotations
 
@@ -15,12 +15,23 @@ from PIL import Image
 from splatmill.files import replacing
 from splatmill_worker.images.copies import SMALL_SIDE, small_grey
 from splatmill_worker.images.decoding import decoders
+from splatmill_worker.images.image_circle import Circle, circle_in, has_dark_corners
+from splatmill_worker.images.lens import pinhole, within
 from splatmill_worker.images.load import training_size
 from splatmill_worker.images.masks import shown_part
 from splatmill_worker.images.overlays.overlay import MIN_PHOTOS, still
-from splatmill_worker.scene import MIN_SHOWN, Overlay, Scene
+from splatmill_worker.scene import MIN_SHOWN, Overlay, Scene, View
 
 Region = npt.NDArray[np.bool_]
+
+FRAME_SIDE = 1024
+"""Longest side of the mask of what lies round a circle."""
+
+FEWEST_OF_A_CIRCLE, MOST_OF_A_CIRCLE = 3, 16
+"""Photos in which a circle is looked for, at least and at most."""
+
+FINER = 2
+"""Times the size of the small pictures at which it is looked for."""
 
 
 @dataclass(frozen=True)
@@ -42,11 +53,13 @@ class Hidden:
     """What is hidden in the photos.
 
     regions: of each photo, bool [h,w] at low resolution; None where nothing is.
+    circles: of each photo, the circle that its picture fills; None where it fills the photo.
     shown: the same by camera, for the report.
     warnings: sentences for the user.
     """
 
     regions: tuple[Region | None, ...]
+    circles: tuple[Circle | None, ...]
     shown: tuple[Overlay, ...]
     warnings: tuple[str, ...]
 
@@ -70,19 +83,30 @@ def in_views(scene: Scene, workdir: Path) -> Scene:
         each
         if region is None
         else replace(
-            each,
+            within_circle(each, circle),
             mask=mask_file(region, each.mask, workdir, upright=each.upright, shown_from=each.shown_from),
             shown_from=MIN_SHOWN,
         )
-        for each, region in zip(views, hidden.regions, strict=True)
+        for each, region, circle in zip(views, hidden.regions, hidden.circles, strict=True)
     )
     return replace(
         scene, views=tuple(masked), warnings=(*scene.warnings, *hidden.warnings), overlays=hidden.shown
     )
 
 
+def within_circle(view: View, circle: Circle | None) -> View:
+    """The view with the limit that a circle sets to its lens, and the pinhole camera of that."""
+    if circle is None or view.lens is None:
+        return view
+    lens = within(view.lens, circle)
+    if lens == view.lens:
+        return view
+    camera = pinhole(lens, view.camera.viewmat)
+    return replace(view, lens=lens, camera=camera.scaled_to(view.camera.width, view.camera.height))
+
+
 def hidden_in(photos: Sequence[Candidate], decode: Callable[[int, tuple[int, int]], Image.Image]) -> Hidden:
-    """What never moves in the photos of one size and of one video or folder.
+    """What never moves in the photos of one size and of one video or folder, and the circles that their pictures fill.
 
     Those with fewer than MIN_PHOTOS in their folder are compared with all of their size.
 
@@ -96,17 +120,32 @@ def hidden_in(photos: Sequence[Candidate], decode: Callable[[int, tuple[int, int
             (size, each.source if counts[size, each.source] >= MIN_PHOTOS else None), []
         ).append(index)
     regions: list[Region | None] = [None] * len(photos)
+    circles: list[Circle | None] = [None] * len(photos)
     shown, warnings = [], []
     for members in groups.values():
         first = photos[members[0]]
-        clear: list[Region] = []
-        found = still(len(members), _pictures(first, members, decode, clear))
-        if found is not None:  # what is transparent in all of them is known to be empty
-            found = found.without(np.logical_and.reduce(clear))
-        if found is None:
-            continue
         names = tuple(photos[index].name for index in members)
         which = f"in {len(names)} photos of {first.width} x {first.height} pixels"
+        clear: list[Region] = []
+        picture = _pictures(first, members, decode, clear)
+        circle = _circle(len(members), picture)
+        if circle is not None:
+            outside = circle.outside(*training_size(first.width, first.height, FRAME_SIDE))
+            what = f"{outside.mean():.0%} of the picture, round a circle, is dark {which}"
+            shown.append(Overlay(names, what, outside))
+            warnings.append(
+                f"{what}, such as {names[0]}. They are taken for photos of a circular fisheye lens, and what lies "
+                "round the circle is masked. If it belongs to the scene, crop the photos."
+            )
+            for index in members:
+                regions[index], circles[index] = outside, circle
+        clear.clear()
+        found = still(len(members), picture)
+        if found is not None:  # what is transparent in all of them, or round the circle, is known to be empty
+            empty = np.logical_and.reduce(clear)
+            found = found.without(empty if circle is None else empty | circle.outside(*empty.shape[::-1]))
+        if found is None:
+            continue
         if not found.masked:
             warnings.append(
                 f"{found.share:.0%} of the picture never changes {which}, such as {names[0]}. Either the camera stood "
@@ -120,8 +159,24 @@ def hidden_in(photos: Sequence[Candidate], decode: Callable[[int, tuple[int, int
             "is masked in all of them; the report shows it. If it belongs to the scene, give photos from more sides."
         )
         for index in members:
-            regions[index] = found.region
-    return Hidden(tuple(regions), tuple(shown), tuple(warnings))
+            regions[index] = _together(regions[index], found.region)
+    return Hidden(tuple(regions), tuple(circles), tuple(shown), tuple(warnings))
+
+
+def _circle(count: int, picture: Callable[[int, int], npt.NDArray[np.float32]]) -> Circle | None:
+    """The circle that the picture of `count` photos fills; None where there is none, or there are too few photos."""
+    if count < FEWEST_OF_A_CIRCLE or not has_dark_corners(picture(0, 1)):
+        return None
+    chosen = np.unique(np.linspace(0, count - 1, MOST_OF_A_CIRCLE).astype(int))
+    return circle_in(np.max([picture(int(index), FINER) for index in chosen], axis=0))
+
+
+def _together(one: Region | None, other: Region) -> Region:
+    """Two regions of one photo as one, at the higher resolution."""
+    if one is None:
+        return other
+    enlarged = Image.fromarray(other).resize(one.shape[::-1], Image.Resampling.NEAREST)
+    return np.asarray(one | np.asarray(enlarged))
 
 
 def _pictures(

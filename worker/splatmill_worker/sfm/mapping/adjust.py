@@ -14,6 +14,7 @@ from splatmill_worker.colmap import pycolmap
 from splatmill_worker.sfm.callbacks import stop_if
 from splatmill_worker.sfm.checks import implausible_intrinsics
 from splatmill_worker.sfm.mapping.registered import registered
+from splatmill_worker.sfm.options import FISHEYE
 
 OPENCV_MIN_PHOTOS = 8
 """Registered photos of a camera from which its four OPENCV distortion coefficients are estimated."""
@@ -77,7 +78,7 @@ def adjust_with_lenses(
     """
     adjust = partial(bundle_adjust, threads=threads, cancelled=cancelled, on_iterations=on_iterations)
     model = registered(model)  # the covariance needs the pose of every photo
-    rich = _well_observed(model)
+    rich = _well_observed(model, "SIMPLE_RADIAL")
     tied: set[int] = set()
     while rich:
         trial = copy.deepcopy(model)
@@ -115,8 +116,17 @@ def median_error(model: pycolmap.Reconstruction) -> float:
     return float(np.median([point.error for point in model.points3D.values()] or [math.inf]))
 
 
-def _well_observed(model: pycolmap.Reconstruction) -> set[int]:
-    """SIMPLE_RADIAL cameras with enough photos and observations for OPENCV's distortion (decisions: OPENCV_CAMERAS)."""
+def use_opencv_fisheye(model: pycolmap.Reconstruction) -> None:
+    """Give the fisheye cameras with enough photos and observations the distortion k1 to k4, in place."""
+    for camera_id in _well_observed(model, FISHEYE):
+        camera = model.cameras[camera_id]
+        focal, cx, cy, k1 = camera.params
+        camera.model = pycolmap.CameraModelId.OPENCV_FISHEYE
+        camera.params = [focal, focal, cx, cy, k1, 0.0, 0.0, 0.0]
+
+
+def _well_observed(model: pycolmap.Reconstruction, name: str) -> set[int]:
+    """Cameras of a model with enough photos and observations for more distortion (decisions: OPENCV_CAMERAS)."""
     photos: dict[int, int] = {}
     observations: dict[int, int] = {}
     for image_id in model.reg_image_ids():
@@ -126,7 +136,7 @@ def _well_observed(model: pycolmap.Reconstruction) -> set[int]:
     return {
         camera_id
         for camera_id, camera in model.cameras.items()
-        if camera.model == pycolmap.CameraModelId.SIMPLE_RADIAL
+        if camera.model.name == name
         and photos.get(camera_id, 0) >= OPENCV_MIN_PHOTOS
         and observations[camera_id] >= OPENCV_MIN_OBSERVATIONS
     }

@@ -28,6 +28,7 @@ from splatmill_worker.images.decoding import decoders
 from splatmill_worker.images.decoding.decoders import mask_fault, photo_colors
 from splatmill_worker.images.examine import too_small
 from splatmill_worker.images.masks import unfit
+from splatmill_worker.images.panoramas import faces
 from splatmill_worker.images.prepare import names_remark
 from splatmill_worker.scene import Scene, Source, View, without
 from splatmill_worker.sfm.posed import colmap_model, parts, programs, transforms
@@ -89,7 +90,7 @@ class PosedInput:
         )
         warnings = [
             *judged.warnings,
-            *lens.remarks(view.lens for view in scene.views),
+            *lens.remarks(view.lens for view in scene.views if not faces.is_divided(view)),
             *self._media_beside(files),
         ]
         colors = [photo_colors(view.image, view.name) for view in scene.views]

@@ -1,4 +1,4 @@
-"""Keeps the last decoded panoramas, since their faces are loaded one after the other, several at a time."""
+"""Keeps the last decoded photos that are divided, since their faces are loaded one after another, several at a time."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from concurrent.futures import Future
 from splatmill_worker.images.decode import Pixels
 
 KEPT_BYTES = 2**29
-"""Size of the panoramas that are kept, at most, and of the last one however large it is: five of 8192 x 4096 pixels."""
+"""Size of the photos that are kept, at most, and of the last one however large it is: five panoramas of 8192 x 4096."""
 
 _kept: OrderedDict[Hashable, Future[Pixels]] = OrderedDict()
 _lock = threading.Lock()
