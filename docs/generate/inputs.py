@@ -295,7 +295,7 @@ def _undistorted(model: str) -> str:
         return "cut into the faces of a cube"
     if model in PINHOLE_MODELS:
         return "as they are"
-    return "undistorted to a pinhole, or to faces" if "FISHEYE" in model else "undistorted to a pinhole"
+    return "undistorted to a pinhole, or where wide to faces"
 
 
 def _points() -> list[str]:

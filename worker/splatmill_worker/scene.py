@@ -184,11 +184,14 @@ class Face:
 
     photo: name of the photo.
     lens: projection of the photo.
+    width, height: of the photo in pixels.
     rotation: from the photo's frame (x right, y down, z towards its middle) to the view's camera, [3,3].
     """
 
     photo: str
     lens: Lens
+    width: int
+    height: int
     rotation: Float
 
 

@@ -10,7 +10,8 @@ class Readiness:
     """Asks `GET /readyz` of the API behind a listening socket of this machine.
 
     A question waits in the queue of that socket while the API starts, and no other is asked until it is answered: an
-    API answers those that have been given up too, and looks for the renderer each time.
+    API answers those that have been given up too, and looks for the renderer each time. With TLS, a connection that the
+    API does not accept within two seconds is given up before anything is asked.
 
     address: host and port on which the socket listens.
     """
@@ -45,8 +46,8 @@ class Readiness:
     def _connection(self) -> http.client.HTTPConnection:
         if os.environ.get("SPLATMILL_TLS_CERTIFICATE"):
             # The socket is our own, whatever names the certificate is for.
-            return http.client.HTTPSConnection(self._host, self._port, timeout=5, context=_unchecked())
-        return http.client.HTTPConnection(self._host, self._port, timeout=5)
+            return http.client.HTTPSConnection(self._host, self._port, timeout=2, context=_unchecked())
+        return http.client.HTTPConnection(self._host, self._port, timeout=2)
 
 
 def _unchecked() -> ssl.SSLContext:

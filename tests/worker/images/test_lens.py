@@ -13,6 +13,7 @@ from PIL import Image
 
 from splatmill_worker.images import lens
 from splatmill_worker.images.load import load_view
+from splatmill_worker.images.panoramas import faces
 from splatmill_worker.scene import Lens, View
 
 W, H = 480, 360
@@ -158,6 +159,38 @@ def test_what_lies_beyond_the_fold_of_a_polynomial_is_masked(tmp_path: Path, own
     assert shown[covered & (length < math.tan(lens.sight(own)) - pixel)].all()
 
 
+@pytest.mark.parametrize(
+    ("own", "degrees"),
+    [
+        # r (1 + k r^2) is largest at r = 1 / sqrt(-3 k). An action camera: no pinhole of 100 degrees has its fold.
+        (
+            Lens("SIMPLE_RADIAL", (216.0, 240.0, 180.0, -0.1), W, H),
+            math.degrees(math.atan(1.0 / math.sqrt(0.3))),
+        ),
+        (Lens("OPENCV", (200.0, 200.0, 240.0, 180.0, -0.1, 0.0, 0.0, 0.0), W, H), 61.29),
+        (Lens("OPENCV_FISHEYE", (100.0, 100.0, 240.0, 180.0, 0.0, -0.08, 0.0, 0.0), W, H), 72.05),
+    ],
+)
+def test_no_face_shows_what_lies_beyond_a_fold(own: Lens, degrees: float) -> None:
+    assert math.degrees(lens.sight(own)) == pytest.approx(degrees, abs=0.2)
+    view = View("a.png", lens.pinhole(own, np.eye(4)), Path("a.png"), lens=own)
+    for face in faces.faces_of(view):
+        if face.face is not None:
+            column, row = np.meshgrid(np.arange(face.camera.width) + 0.5, np.arange(face.camera.height) + 0.5)
+            rays = (
+                np.stack([*face.camera.normalized(column, row), np.ones(row.shape)], axis=-1)
+                @ face.face.rotation
+            )
+            angles = np.degrees(np.arctan2(np.hypot(rays[..., 0], rays[..., 1]), rays[..., 2]))
+            met = lens.distort(own, rays.reshape(-1, 3))[:, 0].reshape(angles.shape)
+            assert (met[angles > degrees] == lens.NOWHERE).all()
+    divided = {own} if faces.is_divided(view) else set()
+    assert (own.model == "OPENCV_FISHEYE") == bool(divided)
+    said = lens.remarks([own], divided)
+    assert any("hold up to 72 degrees" in each for each in said) == bool(divided)
+    assert any("sees more than a pinhole" in each for each in said) != bool(divided)
+
+
 BEHIND = [
     Lens("SIMPLE_FISHEYE", (110.0, 243.0, 178.0), W, H),
     Lens("FISHEYE", (110.0, 112.0, 243.0, 178.0), W, H),
@@ -179,13 +212,13 @@ def test_rays_aside_and_behind_meet_an_equidistant_lens_by_the_equations_of_thos
         across = math.sin(angle) * np.stack([np.cos(turn), np.sin(turn)], axis=1)
         return np.concatenate([across, np.full((200, 1), math.cos(angle))], axis=1) * 3.0
 
-    ahead = {angle: lens.meet(camera, rays(angle)) for angle in (0.01, 0.5, 1.2, 1.55)}
-    steps = [lens.meet(camera, rays(angle)) for angle in np.linspace(1.5, 1.7, 201)]
+    ahead = {angle: lens.pixels_of(camera, rays(angle)) for angle in (0.01, 0.5, 1.2, 1.55)}
+    steps = [lens.pixels_of(camera, rays(angle)) for angle in np.linspace(1.5, 1.7, 201)]
     assert np.abs(np.diff(steps, n=2, axis=0)).max() < 1e-3
     assert np.linalg.norm(np.diff(steps, axis=0), axis=2).min() > 0.0
     monkeypatch.setattr(lens, "ASIDE", math.inf)
     for angle, pixels in ahead.items():
-        np.testing.assert_allclose(lens.meet(camera, rays(angle)), pixels, atol=1e-9)
+        np.testing.assert_allclose(lens.pixels_of(camera, rays(angle)), pixels, atol=1e-9)
 
 
 def test_only_equidistant_lenses_see_behind() -> None:

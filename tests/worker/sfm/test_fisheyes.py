@@ -1,6 +1,6 @@
 """Proves that the cameras of photos of fisheye lenses are recovered: of circular ones, known by their dark frame, and
 of full-frame ones, known by their EXIF; that what they see is divided among faces; and that round pictures of ordinary
-lenses are taken for those.
+lenses are placed, too.
 
 The still life in a room is photographed by the ray caster, whose cameras are the truth.
 """
@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from splatmill_worker.images.panoramas.faces import joined
-from splatmill_worker.scene import Scene
+from splatmill_worker.scene import Float, Scene
 from splatmill_worker.sfm import SfmOptions, reconstruct
 from splatmill_worker.synthetic import look_at
 from splatmill_worker.synthetic.ray_caster import picture
@@ -58,7 +58,8 @@ def test_cameras_of_circular_fisheyes_are_recovered(tmp_path: Path) -> None:
     assert {view.name.split("/")[1] for view in scene.views} == {"front", "right", "left", "up", "down"}
     assert all(view.mask is not None for view in scene.views)
     assert len(scene.overlays[0].photos) == COUNT
-    assert any("circular fisheye lens" in said for said in scene.warnings)
+    assert any("round a circle, is dark in 9 photos" in said for said in scene.warnings)
+    assert any("9 photos are taken for those of a fisheye lens" in said for said in scene.notes)
 
 
 def test_cameras_of_full_frame_fisheyes_are_recovered_by_the_name_of_their_lens(tmp_path: Path) -> None:
@@ -80,23 +81,38 @@ def test_cameras_of_full_frame_fisheyes_are_recovered_by_the_name_of_their_lens(
     assert angle_between(scene, focal * 1.2) == pytest.approx(np.degrees(1.2), abs=0.3)
 
 
-def test_round_pictures_of_an_ordinary_lens_are_taken_for_those(tmp_path: Path) -> None:
-    (tmp_path / "images").mkdir()
+def round_pictures(images: Path, focal: float, count: int, step: float) -> dict[str, Float]:
+    """Photos of an ordinary lens in a round frame, `step` radians apart; their poses by name."""
+    images.mkdir()
     truth = {}
     rows, columns = np.mgrid[:360, :480]
     outside = np.hypot(columns - 240, rows - 180) > 178
-    for number in range(COUNT):
-        angle = 0.25 * number
+    for number in range(count):
+        angle = step * number
         eye = 2.6 * np.array([np.cos(angle), np.sin(angle), 0.35])
-        camera = look_at(eye, np.array([0.0, 0.0, 0.2]), 480, 360, 480.0)
+        camera = look_at(eye, np.array([0.0, 0.0, 0.2]), 480, 360, focal)
         pixels = picture(panoramas.room(), camera, 2)
         pixels[outside] = 0
         name = f"{number}.jpg"
-        Image.fromarray(pixels).save(tmp_path / "images" / name, quality=95, subsampling=0)
+        Image.fromarray(pixels).save(images / name, quality=95, subsampling=0)
         truth[name] = camera.viewmat
+    return truth
+
+
+def test_round_pictures_of_an_ordinary_lens_have_its_angle(tmp_path: Path) -> None:
+    truth = round_pictures(tmp_path / "images", 480.0, 6, 0.25)
     scene = recovered(tmp_path / "images", tmp_path / "work")
-    assert scene.facts["registered"] == COUNT
+    assert scene.facts["registered"] == 6
     assert all(view.face is None for view in scene.views)
     angle, distance = errors(scene, truth)
     assert angle < 1.0
     assert distance < 0.05
+
+
+def test_where_more_are_placed_as_photos_of_an_ordinary_lens_they_are_taken_for_those(tmp_path: Path) -> None:
+    """A tenth of the angle of a fisheye, as of a microscope. Does not prove that such photos are placed well."""
+    round_pictures(tmp_path / "images", 1400.0, 8, 0.12)
+    scene = recovered(tmp_path / "images", tmp_path / "work")
+    assert any(said.startswith("As photos of a fisheye lens, 0 of 8 were placed") for said in scene.notes)
+    assert not any("taken for those of a fisheye lens, by" in said for said in scene.notes)
+    assert not any(view.lens is not None and "FISHEYE" in view.lens.model for view in scene.views)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
@@ -49,11 +49,7 @@ MAX_HALF_ANGLE = 50.0
 cos^2, 2.4 times: wider, its middle is coarse, and a Gaussian is no ellipse, as which it is projected."""
 
 SIGHT_DIRECTIONS, SIGHT_STEPS = 32, 2000
-"""Directions from the optical axis, and steps along each, in which the limit of what a lens sees is searched for."""
-
-_TURNS = np.linspace(0.0, 2.0 * math.pi, SIGHT_DIRECTIONS, endpoint=False)
-DIRECTIONS = np.stack([np.cos(_TURNS), np.sin(_TURNS)], axis=1)
-"""These directions, [SIGHT_DIRECTIONS,2]."""
+"""Directions from the optical axis, and steps along each, in which the limits of what a lens sees are searched for."""
 
 BORDER_SAMPLES = 64
 """Points on each side of the undistorted photo that must lie within the photo."""
@@ -66,6 +62,11 @@ ASIDE = 0.01
 
 NOWHERE = -1e6
 """Pixel position of a ray that the lens does not see, far outside any photo."""
+
+
+_TURNS = np.linspace(0.0, 2.0 * math.pi, SIGHT_DIRECTIONS, endpoint=False)
+DIRECTIONS = np.stack([np.cos(_TURNS), np.sin(_TURNS)], axis=1)
+"""These directions, [SIGHT_DIRECTIONS,2]."""
 
 
 def lens_of(camera: pycolmap.Camera) -> Lens | None:
@@ -156,8 +157,7 @@ def sight(lens: Lens) -> float:
     """
     camera = colmap_camera(lens)
     middle = np.array([camera.principal_point_x, camera.principal_point_y])
-    sees_behind = lens.model in EQUIDISTANT_MODELS
-    most = math.pi if sees_behind else math.atan(_farthest(lens))
+    most = math.pi if lens.model in EQUIDISTANT_MODELS else math.atan(1.0 / ASIDE)
     angles = np.linspace(0.0, most, SIGHT_STEPS + 1)[1:]
     # In units of the focal lengths, a lens puts a ray about in its own direction.
     bent = (_meet_all_round(camera, angles) - middle) / (camera.focal_length_x, camera.focal_length_y)
@@ -187,20 +187,20 @@ def _meet_all_round(camera: pycolmap.Camera, angles: Float) -> Float:
     """Pixel positions [n,SIGHT_DIRECTIONS,2] of rays at `angles` [n] from the axis, in all DIRECTIONS."""
     across = np.sin(angles)[:, None, None] * DIRECTIONS
     along = np.broadcast_to(np.cos(angles)[:, None, None], (*across.shape[:2], 1))
-    return meet(camera, np.concatenate([across, along], axis=2).reshape(-1, 3)).reshape(across.shape)
+    return pixels_of(camera, np.concatenate([across, along], axis=2).reshape(-1, 3)).reshape(across.shape)
 
 
-def _farthest(lens: Lens) -> float:
-    """The tangent of the angle from the axis to the farthest corner of the widest undistorted photo."""
-    return float(np.linalg.norm(_border_rays(lens), axis=1).max()) / _least_zoom(lens)
-
-
-def remarks(lenses: Iterable[Lens | None]) -> list[str]:
+def remarks(lenses: Iterable[Lens | None], divided: Collection[Lens | None] = ()) -> list[str]:
     """Warnings for the user about the photos with these lenses, where the undistorted ones do not show all that a lens
-    sees, or show more; the figures are those of the most common lens. None of them is divided into faces."""
+    sees, or show more; the figures are those of the most common lens.
+
+    divided: the lenses whose photos are divided into faces, which show all.
+    """
     counts = Counter(lens for lens in lenses if lens is not None and lens.model != PANORAMA)
     said = []
-    wide = Counter({lens: count for lens, count in counts.items() if _zoom_of(lens).cut})
+    wide = Counter(
+        {lens: count for lens, count in counts.items() if _zoom_of(lens).cut and lens not in divided}
+    )
     if wide:
         lens = wide.most_common(1)[0][0]
         across = 2.0 * np.degrees(np.arctan(np.ptp(_border_rays(lens), axis=0) / _zoom_of(lens).zoom / 2.0))
@@ -208,11 +208,7 @@ def remarks(lenses: Iterable[Lens | None]) -> list[str]:
             f"The lens of {_counted(wide)} sees more than a pinhole camera can show. The middle is trained on, "
             f"{across[0]:.0f} by {across[1]:.0f} degrees, and the rest of the photos is not used."
         )
-    corner = {
-        lens: math.atan(np.linalg.norm(_border_rays(lens), axis=1).max() / _zoom_of(lens).zoom)
-        for lens in counts
-    }
-    folded = Counter({lens: count for lens, count in counts.items() if corner[lens] > sight(lens)})
+    folded = Counter({lens: count for lens, count in counts.items() if _shows_fold(lens, lens in divided)})
     if folded:
         angle = math.degrees(sight(folded.most_common(1)[0][0]))
         said.append(
@@ -220,6 +216,21 @@ def remarks(lenses: Iterable[Lens | None]) -> list[str]:
             "beyond in the photos is not used."
         )
     return said
+
+
+def _shows_fold(lens: Lens, divided: bool) -> bool:
+    """Whether the undistorted photo, or a face where it is divided, shows what lies beyond the sight of the lens."""
+    limit = sight(lens)
+    if not divided:
+        corner = float(np.linalg.norm(_border_rays(lens), axis=1).max())
+        return math.atan(corner / _zoom_of(lens).zoom) > limit
+    if math.isinf(limit) or lens.limit < limit:
+        return False
+    camera = colmap_camera(lens)
+    middle = np.array([camera.principal_point_x, camera.principal_point_y])
+    fold = np.linalg.norm(_meet_all_round(camera, np.array([limit]))[0] - middle, axis=1).max()
+    corners = np.array([[0.0, 0.0], [lens.width, 0.0], [0.0, lens.height], [lens.width, lens.height]])
+    return bool(np.linalg.norm(corners - middle, axis=1).max() > fold)
 
 
 def _counted(lenses: Counter[Lens]) -> str:
@@ -234,7 +245,7 @@ def distortion(lens: Lens) -> float:
     corner = np.array([[0.0, 0.0], [lens.width, 0.0], [0.0, lens.height], [lens.width, lens.height]])
     frame = np.concatenate([corner, (corner + corner[[1, 3, 0, 2]]) / 2])
     rays = np.stack(without_distortion(camera).normalized(frame[:, 0], frame[:, 1]), axis=1)
-    seen = meet(camera, _ahead(rays))
+    seen = pixels_of(camera, _ahead(rays))
     return float(np.linalg.norm(np.where(np.isfinite(seen), seen, NOWHERE) - frame, axis=1).max())
 
 
@@ -267,7 +278,7 @@ def distort(lens: Lens, rays: Float) -> Float:
 
     Rays that the lens does not see are put at NOWHERE.
     """
-    pixels = meet(colmap_camera(lens), rays)
+    pixels = pixels_of(colmap_camera(lens), rays)
     angles = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
     pixels[angles > min(sight(lens), lens.limit)] = NOWHERE
     return np.where(np.isfinite(pixels), pixels, NOWHERE)
@@ -278,7 +289,7 @@ def _ahead(rays: Float) -> Float:
     return np.concatenate([rays, np.ones((len(rays), 1))], axis=1)
 
 
-def meet(camera: pycolmap.Camera, rays: Float) -> Float:
+def pixels_of(camera: pycolmap.Camera, rays: Float) -> Float:
     """Pixel positions [n,2] of rays [n,3], by the equations of the lens; they may not be finite.
 
     COLMAP puts rays only that go ahead; where a lens is equidistant, the others are put by its equations as well.
@@ -294,7 +305,7 @@ def _meet_equidistant(camera: pycolmap.Camera, rays: Float) -> Float:
     """Pixel positions [n,2] of rays [n,3] on an equidistant lens: the angle from the axis, in the direction of the ray,
     then its distortion (COLMAP, src/colmap/sensor/models.h)."""
     radius = np.hypot(rays[:, 0], rays[:, 1])
-    with np.errstate(invalid="ignore"):  # straight behind is no direction
+    with np.errstate(divide="ignore", invalid="ignore"):  # straight behind is no direction
         bent = rays[:, :2] * (np.arctan2(radius, rays[:, 2]) / radius)[:, None]
     params = np.asarray(camera.params, np.float64)
     extra = params[camera.extra_params_idxs()].tolist()

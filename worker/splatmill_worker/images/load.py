@@ -78,18 +78,37 @@ def load_views(
     sizes = [training_size(view.camera.width, view.camera.height, longest_side) for view in views]
     block = _Block(sizes) if files is None else _Filed(files)
     try:
+        order = _order(views, sizes)
         with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
-            return list(
-                pool.map(
-                    lambda index: block.moved(
-                        index, load_view(views[index], longest_side, background=background)
-                    ),
-                    range(len(views)),
-                )
+            loaded = pool.map(
+                lambda index: block.moved(
+                    index, load_view(views[index], longest_side, background=background)
+                ),
+                order,
             )
+            return [photo for _, photo in sorted(zip(order, loaded, strict=True), key=lambda each: each[0])]
     finally:
         look_ups.forget()
         divided_photos.forget()
+
+
+def _order(views: Sequence[View], sizes: Sequence[tuple[int, int]]) -> list[int]:
+    """The indices of the views in the order in which they are loaded: of as many photos as are kept decoded, first all
+    faces in one direction, whose look-ups are then those of the face before."""
+    places: dict[str, int] = {}
+    keys = []
+    kept = 0
+    for index, (view, (width, height)) in enumerate(zip(views, sizes, strict=True)):
+        if view.face is None:
+            keys.append((kept // divided_photos.KEPT_BYTES, 0, index))
+            continue
+        if view.photo not in places:
+            places[view.photo] = kept // divided_photos.KEPT_BYTES
+            whole = faces.enough(view.face, view.camera.scaled_to(width, height))
+            kept += 2 * 4 * whole[0] * whole[1]
+        direction = list(faces.FACES).index(view.name.removeprefix(f"{view.photo}/"))
+        keys.append((places[view.photo], direction, index))
+    return sorted(range(len(views)), key=lambda index: keys[index])
 
 
 class _Filed:
@@ -205,7 +224,7 @@ def _decode_for(view: View, enough: tuple[int, int]) -> Image.Image:
 def _check_shape(view: View, path: Path, size: tuple[int, int]) -> None:
     """Raise ValueError for a photo or mask whose aspect ratio differs from the camera's by more than rounding."""
     width, height = size
-    whole = view.camera if view.face is None else view.face.lens
+    whole = view.camera if view.face is None else view.face
     expected = whole.width / whole.height
     # Reduced sizes are rounded to whole pixels, which changes the aspect ratio of small photos the most.
     if abs(width / height / expected - 1.0) > 0.02 + 2.0 / min(width, height):

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
 
+from splatmill.schema.quantities import counted
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.images.prepare import UsablePhoto
 
@@ -69,6 +70,17 @@ def group(photos: Sequence[UsablePhoto]) -> list[CameraGroup]:
     for index, key in enumerate(keys):
         groups.setdefault(key if counts[key] >= LEAST_OF_A_FOLDER else key[:-1], []).append(index)
     return [_group(tuple(members), photos[members[0]]) for members in groups.values()]
+
+
+def fisheye_note(groups: Sequence[CameraGroup]) -> list[str]:
+    """A sentence for the user about the photos that are taken for those of a fisheye lens; none without them."""
+    photos = sum(len(group.photos) for group in groups if group.is_fisheye)
+    if not photos:
+        return []
+    return [
+        f"{counted(photos, 'photo is', 'photos are')} taken for those of a fisheye lens, by a round picture in a dark "
+        "frame or by the name of the lens in EXIF."
+    ]
 
 
 def as_pinholes(groups: Sequence[CameraGroup]) -> list[CameraGroup]:

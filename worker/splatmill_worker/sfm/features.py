@@ -269,8 +269,8 @@ def _set_cameras(groups: Sequence[CameraGroup], names: dict[int, str], path: Pat
             params[camera.principal_point_idxs()] = np.multiply(group.center, (camera.width, camera.height))
             camera.params = params.tolist()
             # EXIF initialises the focal length but is not used to verify matches: with a cropped photo or a wrong
-            # tag, the correct ones would fail (decisions: EXIF_FOCAL). No fundamental matrix fits photos of a fisheye,
-            # whose focal length is verified with.
+            # tag, the correct ones would fail (decisions: EXIF_FOCAL). Without a known focal length a fundamental
+            # matrix is fitted, which photos of a fisheye do not follow.
             camera.has_prior_focal_length = group.is_fisheye
             database.update_camera(camera)
     finally:

@@ -87,7 +87,10 @@ def load_model(prepared: Prepared, folder: Path, known: KnownDistance | None = N
         warnings=(
             *prepared.warnings,
             *document["warnings"],
-            *remarks(view.lens for view in scene.views if not faces.is_divided(view)),
+            *remarks(
+                (view.lens for view in scene.views),
+                {view.lens for view in scene.views if faces.is_divided(view)},
+            ),
         ),
         overlays=prepared.overlays,
     )

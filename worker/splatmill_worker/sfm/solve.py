@@ -116,7 +116,9 @@ def reconstruct_photos(
     with ThreadPoolExecutor(threads) as pool, torch_threads(1):
         run = SfmRun(prepared, groups, model, options, folder, threads, pool, on_progress, cancelled)
         run.observer = observer
-        final = final_model(run, _solve(run))
+        solved = _solve(run)
+        run.notes += cameras.fisheye_note(run.groups)
+        final = final_model(run, solved)
         stored = hurried if run.hurried else whole
         store_model(run, final, stored)
     return load_model(prepared, stored, known)
@@ -197,7 +199,7 @@ def _solve(run: SfmRun) -> EffortResult:
         if effort.name != LEAN.name and not result.verified:
             break  # the standard effort has about three times the lean one's features; even more would not match
     assert best is not None  # _efforts returns at least one
-    if best_counts[0] < ENOUGH_PLACED * run.count:
+    if best_counts[0] < ENOUGH_PLACED * run.count and run.has_time_for(1.0):
         best = _without_fisheyes(run, best)
     unfold(run, best)
     return _with_divided_cameras(run, best)

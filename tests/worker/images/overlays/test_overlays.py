@@ -227,3 +227,27 @@ def test_the_masks_of_photos_hide_both(tmp_path: Path) -> None:
     assert path != result.photos[4].mask
     mask = np.asarray(Image.open(path))
     assert (mask[222, 60], mask[30, 260], mask[120, 160]) == (0, 0, 255)
+
+
+def test_round_pictures_are_found_by_folder_and_what_is_still_within_them_too() -> None:
+    rng = np.random.default_rng(0)
+    rows, columns = np.mgrid[:240, :320]
+
+    def taken(radius: float | None) -> Image.Image:
+        pixels = rng.integers(60, 250, (240, 320, 3), np.uint8)
+        if radius is not None:
+            pixels[np.hypot(columns - 160, rows - 120) > radius] = 0
+        return Image.fromarray(pixels)
+
+    radii = {"a": 118.0, "b": None, "c": 100.0}
+    given = [Candidate(f"{folder}/{number}", 320, 240, folder) for folder in radii for number in range(5)]
+    pictures = [taken(radii[each.source]) for each in given]
+    hidden = hidden_in(given, lambda index, size: pictures[index])
+    for each, region, circle in zip(given, hidden.regions, hidden.circles, strict=True):
+        radius = radii[each.source]
+        assert (radius is None) == (circle is None) == (region is None)
+        if radius is not None and circle is not None and region is not None:
+            assert circle.radius * 320 == pytest.approx(radius, abs=2)
+            assert region.mean() == pytest.approx(1 - np.pi * (0.98 * radius) ** 2 / (320 * 240), abs=0.02)
+    assert [len(each.photos) for each in hidden.shown] == [5, 5]
+    assert all("round a circle, is dark in 5 photos of 320 x 240" in said for said in hidden.warnings)

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from splatmill_worker.images import look_ups
 from splatmill_worker.images.lens import pinhole, remarks
 from splatmill_worker.images.load import load_view, load_views
 from splatmill_worker.images.panoramas import faces
@@ -124,6 +126,26 @@ def test_masks_alpha_and_the_edge_of_the_photo_are_cut_with_it(tmp_path: Path) -
     assert (front.rgb[front.camera.height // 2 :] == 200).all()
 
 
+def test_faces_of_many_photos_share_their_look_ups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each direction is computed once where the look-ups of two are not kept, and the photos come in their order."""
+    views = [written(tmp_path / f"{number}.png", 185.0) for number in range(3)]
+    divided = [face for view in views for face in faces.faces_of(view)]
+    computed: list[object] = []
+    compute = look_ups._computed
+    monkeypatch.setattr(look_ups, "KEPT_BYTES", 1)
+
+    def counted(*key: Any) -> look_ups.LookUp:
+        computed.append(key)
+        return compute(*key)
+
+    monkeypatch.setattr(look_ups, "_computed", counted)
+    photos = load_views(divided, 1000, threads=1)
+    assert len(computed) == 5
+    assert [photo.view.name for photo in photos] == [face.name for face in divided]
+    for photo, face in zip(photos, divided, strict=True):
+        np.testing.assert_array_equal(photo.rgb, load_view(face, 1000).rgb)
+
+
 def test_a_photo_of_another_shape_is_refused_with_its_own_size(tmp_path: Path) -> None:
     view = of_lens(tmp_path / "a.png", 180.0, np.eye(4))
     Image.new("RGB", (view.camera.width, view.camera.width // 2)).save(tmp_path / "a.png")
@@ -134,7 +156,7 @@ def test_a_photo_of_another_shape_is_refused_with_its_own_size(tmp_path: Path) -
 
 
 def test_points_go_to_a_face_and_back(tmp_path: Path) -> None:
-    views = [of_lens(tmp_path / f"{k}.jpg", 240.0, pose) for k, pose in enumerate(panoramas.walk(2))]
+    views = [of_lens(tmp_path / f"{k}.jpg", 240.0, pose, scale=2) for k, pose in enumerate(panoramas.walk(2))]
     points = np.random.default_rng(0).normal(size=(100, 3)) * 3
     tracks = PointViews(np.arange(0, 201, 2), np.tile(np.array([0, 1], np.int32), 100))
     scene = Scene(tuple(views), points, np.zeros((100, 3), np.uint8), "colmap", point_views=tracks)

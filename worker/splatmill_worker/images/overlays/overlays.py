@@ -120,30 +120,28 @@ def hidden_in(photos: Sequence[Candidate], decode: Callable[[int, tuple[int, int
             (size, each.source if counts[size, each.source] >= MIN_PHOTOS else None), []
         ).append(index)
     regions: list[Region | None] = [None] * len(photos)
-    circles: list[Circle | None] = [None] * len(photos)
     shown, warnings = [], []
+    circles = _circles(photos, decode)
+    for circle in dict.fromkeys(circle for circle in circles if circle is not None):
+        members = [index for index, each in enumerate(circles) if each == circle]
+        first, names = photos[members[0]], tuple(photos[index].name for index in members)
+        outside = circle.outside(*training_size(first.width, first.height, FRAME_SIDE))
+        what = f"{outside.mean():.0%} of the picture, round a circle, is dark {_which(photos, members)}"
+        shown.append(Overlay(names, what, outside))
+        warnings.append(
+            f"{what}, such as {names[0]}. It is taken for the frame of what a lens shows, and is masked in all of "
+            "them; the report shows it."
+        )
+        for index in members:
+            regions[index] = outside
     for members in groups.values():
-        first = photos[members[0]]
-        names = tuple(photos[index].name for index in members)
-        which = f"in {len(names)} photos of {first.width} x {first.height} pixels"
+        names, which = tuple(photos[index].name for index in members), _which(photos, members)
         clear: list[Region] = []
-        picture = _pictures(first, members, decode, clear)
-        circle = _circle(len(members), picture)
-        if circle is not None:
-            outside = circle.outside(*training_size(first.width, first.height, FRAME_SIDE))
-            what = f"{outside.mean():.0%} of the picture, round a circle, is dark {which}"
-            shown.append(Overlay(names, what, outside))
-            warnings.append(
-                f"{what}, such as {names[0]}. They are taken for photos of a circular fisheye lens, and what lies "
-                "round the circle is masked. If it belongs to the scene, crop the photos."
-            )
-            for index in members:
-                regions[index], circles[index] = outside, circle
-        clear.clear()
-        found = still(len(members), picture)
-        if found is not None:  # what is transparent in all of them, or round the circle, is known to be empty
-            empty = np.logical_and.reduce(clear)
-            found = found.without(empty if circle is None else empty | circle.outside(*empty.shape[::-1]))
+        found = still(len(members), _pictures(photos, circles, members, decode, clear))
+        if (
+            found is not None
+        ):  # what is transparent in all of them, or round their circles, is known to be empty
+            found = found.without(np.logical_and.reduce(clear))
         if found is None:
             continue
         if not found.masked:
@@ -163,12 +161,31 @@ def hidden_in(photos: Sequence[Candidate], decode: Callable[[int, tuple[int, int
     return Hidden(tuple(regions), tuple(circles), tuple(shown), tuple(warnings))
 
 
-def _circle(count: int, picture: Callable[[int, int], npt.NDArray[np.float32]]) -> Circle | None:
-    """The circle that the picture of `count` photos fills; None where there is none, or there are too few photos."""
-    if count < FEWEST_OF_A_CIRCLE or not has_dark_corners(picture(0, 1)):
-        return None
-    chosen = np.unique(np.linspace(0, count - 1, MOST_OF_A_CIRCLE).astype(int))
-    return circle_in(np.max([picture(int(index), FINER) for index in chosen], axis=0))
+def _which(photos: Sequence[Candidate], members: Sequence[int]) -> str:
+    first = photos[members[0]]
+    return f"in {len(members)} photos of {first.width} x {first.height} pixels"
+
+
+def _circles(
+    photos: Sequence[Candidate], decode: Callable[[int, tuple[int, int]], Image.Image]
+) -> tuple[Circle | None, ...]:
+    """The circle that the picture of each photo fills, by the photos of one size and of one video or folder; those with
+    fewer than FEWEST_OF_A_CIRCLE are taken with others of their size. None where there is none."""
+    kinds = Counter((each.width, each.height, each.source) for each in photos)
+    groups: dict[tuple[object, ...], list[int]] = {}
+    for index, each in enumerate(photos):
+        kind = each.width, each.height, each.source
+        groups.setdefault(kind if kinds[kind] >= FEWEST_OF_A_CIRCLE else kind[:2], []).append(index)
+    circles: list[Circle | None] = [None] * len(photos)
+    for members in groups.values():
+        picture = _pictures(photos, circles, members, decode, [])
+        if len(members) < FEWEST_OF_A_CIRCLE or not has_dark_corners(picture(0, 1)):
+            continue
+        chosen = np.unique(np.linspace(0, len(members) - 1, MOST_OF_A_CIRCLE).astype(int))
+        circle = circle_in(np.max([picture(int(index), FINER) for index in chosen], axis=0))
+        for index in members:
+            circles[index] = circle
+    return tuple(circles)
 
 
 def _together(one: Region | None, other: Region) -> Region:
@@ -180,15 +197,17 @@ def _together(one: Region | None, other: Region) -> Region:
 
 
 def _pictures(
-    first: Candidate,
+    photos: Sequence[Candidate],
+    circles: Sequence[Circle | None],
     members: Sequence[int],
     decode: Callable[[int, tuple[int, int]], Image.Image],
     clear: list[Region],
 ) -> Callable[[int, int], npt.NDArray[np.float32]]:
-    """The grey pictures of the photos `members`, as `still` asks for them; `first` is one of them.
+    """The grey pictures of the photos `members`, as `still` asks for them.
 
-    clear: gets the transparent part [h,w] of each small one.
+    clear: gets what is transparent in each small one, or lies round its circle, [h,w].
     """
+    first = photos[members[0]]
 
     def picture(index: int, factor: int) -> npt.NDArray[np.float32]:
         width, height = training_size(first.width, first.height, SMALL_SIDE)
@@ -196,7 +215,9 @@ def _pictures(
         photo = decode(members[index], size)
         if factor == 1:
             alpha = photo.getchannel("A") if photo.mode == "RGBA" else Image.new("L", size, 255)
-            clear.append(np.asarray(alpha.resize(size, Image.Resampling.HAMMING)) < 128)
+            empty = np.asarray(alpha.resize(size, Image.Resampling.HAMMING)) < 128
+            circle = circles[members[index]]
+            clear.append(empty if circle is None else empty | circle.outside(*size))
         grey = Image.fromarray(small_grey(photo, SMALL_SIDE * factor))
         return np.asarray(grey.resize(size, Image.Resampling.HAMMING), np.float32)
 

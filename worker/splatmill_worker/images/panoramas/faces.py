@@ -91,7 +91,7 @@ def faces_of(view: View) -> tuple[View, ...]:
                 camera=side.cropped(column, row, width, height),
                 lens=None,
                 other=None,
-                face=Face(view.name, lens, FACES[name]),
+                face=Face(view.name, lens, view.camera.width, view.camera.height, FACES[name]),
             )
         )
     return tuple(divided)
@@ -138,6 +138,7 @@ def whole_of(face: View) -> View:
         if lens.model == PANORAMA
         else pinhole(lens, viewmat)
     )
+    camera = camera.scaled_to(face.face.width, face.face.height)
     return replace(face, name=face.face.photo, camera=camera, lens=lens, face=None)
 
 

@@ -90,7 +90,10 @@ class PosedInput:
         )
         warnings = [
             *judged.warnings,
-            *lens.remarks(view.lens for view in scene.views if not faces.is_divided(view)),
+            *lens.remarks(
+                (view.lens for view in scene.views),
+                {view.lens for view in scene.views if faces.is_divided(view)},
+            ),
             *self._media_beside(files),
         ]
         colors = [photo_colors(view.image, view.name) for view in scene.views]

@@ -16,7 +16,7 @@ from plyfile import PlyData, PlyElement
 
 from splatmill.files import replacing
 from splatmill_worker.colmap import pycolmap, write_model
-from splatmill_worker.images.lens import PANORAMA, colmap_camera, meet
+from splatmill_worker.images.lens import PANORAMA, colmap_camera, pixels_of
 from splatmill_worker.images.panoramas.faces import joined
 from splatmill_worker.scene import Float, Scene, View
 from splatmill_worker.sfm.posed.transforms import OPENGL_TO_OPENCV
@@ -81,7 +81,7 @@ def model_of(views: list[View], points: Float, scene: Scene) -> pycolmap.Reconst
             model.add_camera_with_trivial_rig(camera)
         cameras.append(model.cameras[ids[key]])
         local = view.camera.to_camera(points[rows[index]])
-        places = meet(cameras[-1], local)
+        places = pixels_of(cameras[-1], local)
         unseen = ~np.isfinite(places).all(axis=1)
         places[unseen] = np.asarray(cameras[-1].img_from_cam(local[unseen], False), np.float64).reshape(-1, 2)
         image = pycolmap.Image(view.name, places, camera_id=ids[key], image_id=index + 1)

@@ -116,7 +116,7 @@ class Facts:
     photos_on_disk: whether they were loaded into files, since that is more than photos may take of the memory.
     seconds_left: what the job has left of the option `within` when the plan is made; None without that option.
     no_lpips: why LPIPS cannot be measured here, a sentence; None where it can.
-    faces: number of photos, held-out ones included, that are faces of panoramas.
+    faces: number of photos, held-out ones included, that are faces of panoramas or of photos of wide lenses.
     """
 
     views: int

@@ -166,7 +166,7 @@ def _poses(facts: Facts, kernels: Kernels, scale: float) -> Decision[bool]:
     seen = f"The median reprojection error is {error:.2f} pixels"
     if facts.faces:
         return Decision(
-            False, f"{seen}, but the faces of a panorama share a camera, and would be corrected apart."
+            False, f"{seen}, but the faces of a photo share a camera, and would be corrected apart."
         )
     if error < MIN_POSE_ERROR:
         return Decision(False, f"{seen}; cameras are corrected from {MIN_POSE_ERROR:g} pixel.")
