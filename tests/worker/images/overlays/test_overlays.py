@@ -251,3 +251,19 @@ def test_round_pictures_are_found_by_folder_and_what_is_still_within_them_too() 
             assert region.mean() == pytest.approx(1 - np.pi * (0.98 * radius) ** 2 / (320 * 240), abs=0.02)
     assert [len(each.photos) for each in hidden.shown] == [5, 5]
     assert all("round a circle, is dark in 5 photos of 320 x 240" in said for said in hidden.warnings)
+
+
+def test_a_ball_that_was_cut_out_is_no_round_picture() -> None:
+    rows, columns = np.mgrid[:240, :320]
+    inside = np.hypot(columns - 160, rows - 120) < 110
+    rng = np.random.default_rng(0)
+    pictures = []
+    for _ in range(5):
+        levels = np.where(inside[..., None], rng.integers(60, 250, (240, 320, 3)), 0)
+        pixels = np.concatenate([levels, np.where(inside, 255, 0)[..., None]], axis=2)
+        pictures.append(Image.fromarray(pixels.astype(np.uint8)))
+    given = [Candidate(f"{number}.png", 320, 240, ".") for number in range(5)]
+    hidden = hidden_in(given, lambda index, size: pictures[index])
+    assert hidden.circles == hidden.regions == (None,) * 5
+    opaque = hidden_in(given, lambda index, size: pictures[index].convert("RGB"))
+    assert None not in opaque.circles

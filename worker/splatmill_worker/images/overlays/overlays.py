@@ -138,9 +138,8 @@ def hidden_in(photos: Sequence[Candidate], decode: Callable[[int, tuple[int, int
         names, which = tuple(photos[index].name for index in members), _which(photos, members)
         clear: list[Region] = []
         found = still(len(members), _pictures(photos, circles, members, decode, clear))
-        if (
-            found is not None
-        ):  # what is transparent in all of them, or round their circles, is known to be empty
+        # What is transparent in all of them, or lies round their circles, is known to be empty.
+        if found is not None:
             found = found.without(np.logical_and.reduce(clear))
         if found is None:
             continue
@@ -178,8 +177,12 @@ def _circles(
         groups.setdefault(kind if kinds[kind] >= FEWEST_OF_A_CIRCLE else kind[:2], []).append(index)
     circles: list[Circle | None] = [None] * len(photos)
     for members in groups.values():
-        picture = _pictures(photos, circles, members, decode, [])
-        if len(members) < FEWEST_OF_A_CIRCLE or not has_dark_corners(picture(0, 1)):
+        if len(members) < FEWEST_OF_A_CIRCLE:
+            continue
+        clear: list[Region] = []
+        picture = _pictures(photos, circles, members, decode, clear)
+        # A ball that was cut out is round, too, and what is transparent around it is known.
+        if not has_dark_corners(picture(0, 1)) or clear[0].any():
             continue
         chosen = np.unique(np.linspace(0, len(members) - 1, MOST_OF_A_CIRCLE).astype(int))
         circle = circle_in(np.max([picture(int(index), FINER) for index in chosen], axis=0))
