@@ -42,6 +42,17 @@ def angle_between(scene: Scene, near: float) -> float:
     return float(np.degrees(np.interp(near, places, angles)))
 
 
+def recovered_as_taken(folder: Path, truth: dict[str, Float], focal: float) -> Scene:
+    """The scene of COUNT photos, whose cameras and lens are those that took them."""
+    scene = recovered(folder / "images", folder / "work")
+    assert scene.facts["registered"] == COUNT
+    angle, distance = errors(scene, truth)
+    assert angle < 0.5
+    assert distance < 0.02
+    assert angle_between(scene, focal * 1.2) == pytest.approx(np.degrees(1.2), abs=0.3)
+    return scene
+
+
 def test_cameras_of_circular_fisheyes_are_recovered(tmp_path: Path) -> None:
     focal = SIDE / 2 / np.radians(185.0 / 2)
     truth = {f"{number}.jpg": pose for number, pose in enumerate(panoramas.walk(COUNT))}
@@ -49,12 +60,7 @@ def test_cameras_of_circular_fisheyes_are_recovered(tmp_path: Path) -> None:
     for name, pose in truth.items():
         pixels = panoramas.fisheye(panoramas.room(), pose, (SIDE, SIDE), focal, 185.0, 1)
         Image.fromarray(pixels).save(tmp_path / "images" / name, quality=95, subsampling=0)
-    scene = recovered(tmp_path / "images", tmp_path / "work")
-    assert scene.facts["registered"] == COUNT
-    angle, distance = errors(scene, truth)
-    assert angle < 0.5
-    assert distance < 0.02
-    assert angle_between(scene, focal * 1.2) == pytest.approx(np.degrees(1.2), abs=0.3)
+    scene = recovered_as_taken(tmp_path, truth, focal)
     assert {view.name.split("/")[1] for view in scene.views} == {"front", "right", "left", "up", "down"}
     assert all(view.mask is not None for view in scene.views)
     assert len(scene.overlays[0].photos) == COUNT
@@ -73,12 +79,7 @@ def test_cameras_of_full_frame_fisheyes_are_recovered_by_the_name_of_their_lens(
         exif[0x010F], exif[0x0110] = "Maker", "Body"
         exif.get_ifd(0x8769)[0xA434] = "15mm F2.8 Diagonal FISHEYE"
         Image.fromarray(pixels).save(tmp_path / "images" / name, quality=95, subsampling=0, exif=exif)
-    scene = recovered(tmp_path / "images", tmp_path / "work")
-    assert scene.facts["registered"] == COUNT
-    angle, distance = errors(scene, truth)
-    assert angle < 0.5
-    assert distance < 0.02
-    assert angle_between(scene, focal * 1.2) == pytest.approx(np.degrees(1.2), abs=0.3)
+    recovered_as_taken(tmp_path, truth, focal)
 
 
 def round_pictures(images: Path, focal: float, count: int, step: float) -> dict[str, Float]:
