@@ -77,7 +77,7 @@ def compared(scene: str, folder: Path, options: argparse.Namespace) -> Iterator[
     for tiles in options.tiles:
         root = folder / f"tiles-{tiles}"
         root.mkdir()
-        plan = PlanFolder(root, ScenePlan(digest, asked, tiles))
+        plan = PlanFolder(root, ScenePlan(digest, asked.model_copy(update={"tiles": tiles})))
         plan.capture.parent.mkdir()
         plan.capture.symlink_to(folder / "capture")
         plan.save()

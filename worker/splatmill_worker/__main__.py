@@ -86,8 +86,7 @@ def main(argv: list[str] | None = None) -> int:
     plan.add_argument(
         "--capture", type=Path, required=True, help="folder of the photos, which is moved there"
     )
-    plan.add_argument("--options", default="{}", help="TrainOptions as JSON")
-    plan.add_argument("--tiles", type=int, required=True)
+    plan.add_argument("--options", required=True, help="TrainOptions with tiles, as JSON")
     unit = programs.add_parser("unit", help="do one unit of a plan, or all that are left")
     unit.add_argument("folder", type=Path)
     unit.add_argument("name", nargs="?")
@@ -150,7 +149,7 @@ def main(argv: list[str] | None = None) -> int:
             from splatmill_worker.tiles import command
 
         if chosen.program == "plan":
-            return command.make_plan(chosen.folder, chosen.capture, chosen.options, chosen.tiles)
+            return command.make_plan(chosen.folder, chosen.capture, chosen.options)
         if chosen.program == "unit":
             return command.do_unit(chosen.folder, chosen.name)
         return command.list_units(chosen.folder, as_json=chosen.json)

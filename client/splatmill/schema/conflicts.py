@@ -42,6 +42,16 @@ def _is_model(start: str | None) -> bool:
     )
 
 
+def _in_one_piece(name: str, is_given: Callable[[Any], bool]) -> Conflict:
+    """The conflict of an option with tiles."""
+    return Conflict(
+        ("tiles", name),
+        lambda tiles, value: tiles is not None and is_given(value),
+        f"The option {name} is for a training in one piece: tiles are trained by several workers, each to the end of "
+        f"its steps. Leave out {name} (preset and steps say how long each part is trained), or tiles.",
+    )
+
+
 CONFLICTS = (
     Conflict(
         ("pose_refinement", "backend"),
@@ -63,6 +73,11 @@ CONFLICTS = (
         lambda gaps, start: gaps == "on" and _is_model(start),
         "Gaps between points are filled, and start names a model: set gaps to auto, or leave start out.",
     ),
+    _in_one_piece("time_budget", lambda budget: budget is not None),
+    _in_one_piece("within", lambda within: within is not None),
+    _in_one_piece("start", lambda start: start is not None),
+    _in_one_piece("progress_video", lambda video: video != "off"),
+    _in_one_piece("time_lapse", lambda lapse: lapse == "on"),
 )
 """All pairs of training options that exclude each other."""
 

@@ -40,6 +40,9 @@ PRESET_GAIN = {Preset.draft: 0.5, Preset.balanced: 0.2, Preset.quality: 0.05}
 """dB on validation photos: a preset ends the training once the last doubling of the steps has gained less
 (decisions: PRESET_GAIN)."""
 
+MOST_TILES = 1024
+"""Largest number of tiles of a scene."""
+
 PHOTOS_PER_VALIDATION = 12
 """Training photos for each one that is set aside to measure what a doubling gains: fewer than are held out, since
 training misses them."""
@@ -178,6 +181,17 @@ class TrainOptions(Request):
             "the free memory of the GPU."
         ),
         json_schema_extra=_BUDGET | {"kind": "bytes"},
+    )
+    tiles: int | None = Field(
+        default=None,
+        ge=2,
+        le=MOST_TILES,
+        description=(
+            "Number of parts that a large scene is trained in, after a coarse model of everything: each needs less "
+            "memory, and workers that are free train them beside each other. Left out, the scene is trained in one "
+            "piece, which small scenes are faster in."
+        ),
+        json_schema_extra=_BUDGET,
     )
     image_size: int | None = Field(
         default=None,

@@ -151,6 +151,7 @@ class Reaper:
         withdrawn = queue.withdraw(
             self.connection, row.id, row.generation
         )  # from its line even without a record
+        queue.withdraw_tiles(self.connection, row.id, row.generation, row.options.tiles)
         absent = status.state == "absent" and not self._is_restored(row.id)
         if withdrawn or status.state in _ENDED or absent:
             try:
@@ -210,6 +211,7 @@ class Reaper:
         return published
 
     def _give_up(self, row: JobRow, status: queue.QueueStatus) -> None:
+        queue.withdraw_tiles(self.connection, row.id, row.generation, row.options.tiles)
         if self._has_succeeded(row):
             self.jobs.retire(row.id)
             return

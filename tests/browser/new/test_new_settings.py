@@ -7,6 +7,7 @@ Does not prove that these are all such pairs (tests/worker/splat/plan/test_confl
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +19,17 @@ from tests.browser.conftest import SmallModel, Visit
 from tests.browser.new.test_new import CHECKED, give, opened
 
 EXCLUDED = {
-    "pose_refinement": ("on", "gpu"),
-    "cluster_culling": ("on", "gpu"),
-    "far_shell": ("on", "model.spz"),
-    "gaps": ("on", "model.spz"),
-    "scale": ("still_00.jpg still_01.jpg 2m", "scan.las"),
+    ("pose_refinement", "backend"): ("on", "gpu"),
+    ("cluster_culling", "backend"): ("on", "gpu"),
+    ("far_shell", "start"): ("on", "model.spz"),
+    ("gaps", "start"): ("on", "model.spz"),
+    ("tiles", "time_budget"): ("4", "60s"),
+    ("tiles", "within"): ("4", "10m"),
+    ("tiles", "start"): ("4", "scan.las"),
+    ("tiles", "progress_video"): ("4", "view"),
+    ("tiles", "time_lapse"): ("4", "on"),
 }
-"""Values that exclude each other, by the first of their options."""
+"""Values that exclude each other, by their options."""
 
 
 def put(page: Page, name: str, value: str) -> None:
@@ -54,14 +59,14 @@ def test_settings_that_exclude_each_other_are_refused_where_they_are(
     give(page, *sorted(photos.iterdir())[:3])
     addresses = sent(page)
     page.get_by_text("All settings").click()
-    values = dict(zip(conflict.names, EXCLUDED[conflict.names[0]], strict=True))
+    values = dict(zip(conflict.names, EXCLUDED[conflict.names], strict=True))
     for name, value in values.items():
         expect(page.locator(f"#option-{name}-error")).to_be_empty()
         put(page, name, value)
-    said = conflict.reason
-    for name, title in (("pose_refinement", "Pose refinement"), ("cluster_culling", "Cluster culling")):
-        said = said.replace(name, f'"{title}"')
-    said = said.replace("far_shell", '"Far shell"')
+    # Names that are no words are shown as the titles of the settings.
+    said = re.sub(
+        r"\b[a-z]+_[a-z]+\b", lambda name: f'"{name[0].replace("_", " ").capitalize()}"', conflict.reason
+    )
     for name in conflict.names:
         expect(page.locator(f"#option-{name}-error")).to_have_text(said)
         expect(page.locator(f"#option-{name}")).to_have_attribute("aria-invalid", "true")

@@ -21,7 +21,7 @@ from splatmill_worker.tiles.units import ScenePlan
 
 @pytest.fixture
 def shared(tmp_path: Path) -> PlanFolder:
-    made = PlanFolder(tmp_path / "plan", ScenePlan("d", TrainOptions(), 2))
+    made = PlanFolder(tmp_path / "plan", ScenePlan("d", TrainOptions(tiles=2)))
     made.save()
     return PlanFolder.open(tmp_path / "plan")
 

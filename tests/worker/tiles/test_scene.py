@@ -30,15 +30,16 @@ from tests.support.made_once import made_once
 
 pytestmark = pytest.mark.slow
 
-OPTIONS = TrainOptions.model_validate({"steps": 200, "seed": 1, "max_gaussians": 3000, "holdout": 5})
-TILES = 2
+OPTIONS = TrainOptions.model_validate(
+    {"steps": 200, "seed": 1, "max_gaussians": 3000, "holdout": 5, "tiles": 2}
+)
 
 
 def planned(photos: Path, root: Path, **options: int) -> str:
     """What the command prints that plans the scene with OPTIONS, but for these."""
-    asked = {**OPTIONS.model_dump(include={"steps", "seed", "max_gaussians", "holdout"}), **options}
+    asked = {**OPTIONS.model_dump(include={"steps", "seed", "max_gaussians", "holdout", "tiles"}), **options}
     flags = [text for name, value in asked.items() for text in (f"--{name.replace('_', '-')}", str(value))]
-    return done("splatmill", "plan", str(photos), "-o", str(root), "--tiles", str(TILES), *flags)
+    return done("splatmill", "plan", str(photos), "-o", str(root), *flags)
 
 
 def program(*arguments: str) -> subprocess.Popen[str]:
@@ -221,31 +222,10 @@ def test_units_are_listed(whole: Path, tmp_path: Path, capsys: pytest.CaptureFix
     assert "Its units are cameras, coarse, tile-1" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    "given",
-    [
-        {"time_budget": 60},
-        {"within": 600},
-        {"progress_video": "orbit"},
-        {"time_lapse": "on"},
-        {"start": "a.ply"},
-    ],
-)
-def test_options_of_a_training_in_one_piece_are_refused(
-    given: dict[str, object], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    asked = TrainOptions.model_validate(given)
-    capture = still_life.posed_capture(tmp_path / "capture")
-    assert command.make_plan(tmp_path, capture, asked.model_dump_json(), 2) == command.REFUSED
-    assert not capture.exists()
-    assert f"The option {next(iter(given))} is for" in capsys.readouterr().err
-    assert not (tmp_path / "plan.json").exists()
-
-
 def test_a_capture_without_cameras_fails_once_and_says_why(tmp_path: Path) -> None:
     (tmp_path / "capture" / "images").mkdir(parents=True)
     (tmp_path / "capture" / "images" / "a.txt").write_text("no photo")
-    assert command.make_plan(tmp_path, tmp_path / "capture", OPTIONS.model_dump_json(), 2) == 0
+    assert command.make_plan(tmp_path, tmp_path / "capture", OPTIONS.model_dump_json()) == 0
     process = program("splatmill", "unit", str(tmp_path))
     text, _ = process.communicate(timeout=100)
     assert process.returncode == command.FAILED
@@ -270,7 +250,7 @@ def test_an_attempt_that_another_machine_may_do_is_no_failure(
 ) -> None:
     asked = OPTIONS.model_copy(update={"backend": Backend.gpu})
     capture = still_life.posed_capture(tmp_path / "capture")
-    assert command.make_plan(tmp_path, capture, asked.model_dump_json(), 2) == 0
+    assert command.make_plan(tmp_path, capture, asked.model_dump_json()) == 0
     assert command.do_unit(tmp_path, "cameras") == 0
     lacking = absence() is not None
     assert command.do_unit(tmp_path, "coarse") == (command.BROKEN if lacking else 0)
@@ -282,11 +262,11 @@ def test_an_attempt_that_another_machine_may_do_is_no_failure(
 
 def test_a_failure_is_forgotten_with_a_new_plan(tmp_path: Path) -> None:
     capture = still_life.posed_capture(tmp_path / "capture")
-    assert command.make_plan(tmp_path, capture, OPTIONS.model_dump_json(), 2) == 0
+    assert command.make_plan(tmp_path, capture, OPTIONS.model_dump_json()) == 0
     with PlanFolder.open(tmp_path).claimed("cameras") as run:
         run.fail("No photo is left.", "")
     assert PlanFolder.open(tmp_path).states() == {"cameras": "failed"}
     again = still_life.posed_capture(tmp_path / "again")
-    assert command.make_plan(tmp_path, again, OPTIONS.model_dump_json(), 2) == 0
+    assert command.make_plan(tmp_path, again, OPTIONS.model_dump_json()) == 0
     assert PlanFolder.open(tmp_path).states() == {}
     assert not again.exists()

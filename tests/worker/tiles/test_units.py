@@ -11,7 +11,7 @@ from splatmill_worker.tiles.units import CAMERA_OPTIONS, ScenePlan, State
 
 
 def plan(tiles: int = 4, digest: str = "d", **options: object) -> ScenePlan:
-    return ScenePlan(digest, TrainOptions.model_validate(options), tiles)
+    return ScenePlan(digest, TrainOptions.model_validate(options | {"tiles": tiles}))
 
 
 @pytest.mark.parametrize("seed", range(50))

@@ -16,7 +16,7 @@ from splatmill.backplane.jobs import row as rows
 from splatmill.backplane.jobs.fold import fold
 from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.records import UnreadableRecord
-from splatmill_worker.service.job_folder import LOCK_SECONDS, bytes_in, hold, remove_remade
+from splatmill_worker.service.job_folder import LOCK_SECONDS, bytes_in, hold, remove_remade, tile_folders
 from splatmill_worker.service.room import is_counted, leave
 from splatmill_worker.settings import data_folder, keep_work, work_folder
 
@@ -38,6 +38,10 @@ def remove_abandoned(connection: redis.Redis, keep: float | None = None) -> list
     removed = []
     work = data_folder() / "work"
     for folder in sorted(work.iterdir()) if work.is_dir() else ():
+        of_tiles = folder.name.partition("_")[0]
+        if folder.name != of_tiles and layout.is_id(of_tiles) and not _is_active(connection, of_tiles):
+            _remove_unheld(folder)
+            continue
         if not layout.is_id(folder.name) or _is_active(connection, folder.name):
             continue
         with hold(folder) as held:
@@ -59,14 +63,24 @@ def remove_abandoned(connection: redis.Redis, keep: float | None = None) -> list
 def tidy(connection: redis.Redis, job_id: str) -> None:
     """Remove what is made anew from the folder of a job whose attempt has just ended, if no other is to follow."""
     folder = work_folder(job_id)
-    if not folder.is_dir() or not _is_over(connection, job_id):
+    tiles = tile_folders(job_id)
+    if not (folder.is_dir() or tiles) or not _is_over(connection, job_id):
         return
+    for path in tiles:
+        _remove_unheld(path)
     # What the attempt started has been killed, and may hold the lock for a moment.
     with hold(folder, seconds=LOCK_SECONDS) as held:
         if held:
             remove_remade(folder)
             if (owner := _owner(connection, job_id)) is not None:
                 leave(connection, owner, job_id, bytes_in(folder))
+
+
+def _remove_unheld(folder: Path) -> None:
+    """Remove a folder of tiles, unless a process does one in it."""
+    with hold(folder) as held:
+        if held:
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def _is_over(connection: redis.Redis, job_id: str) -> bool:

@@ -4,11 +4,16 @@ The worker requests it by a signal to the attempt's process. The pipeline polls 
 """
 
 import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import FrameType
 
 SIGNAL = signal.SIGUSR1
 """The signal that requests it. SIGTERM cannot serve: loading pycolmap replaces its handler by one that prints a stack
 trace and ends the process."""
+
+HANDLED = {signal.SIGTERM, signal.SIGINT, SIGNAL}
+"""The signals that a worker and its attempts handle."""
 
 
 class HandedBack(BaseException):
@@ -37,3 +42,15 @@ def install_signal_handlers() -> None:
 def _request(signum: int, frame: FrameType | None) -> None:
     global _requested
     _requested = True
+
+
+@contextmanager
+def blocked_signals() -> Iterator[None]:
+    """Keep the signals that a worker handles from this thread, and from the process that it forks, until the end of the
+    block. Another thread may receive them meanwhile; the worker's handlers then run here all the same.
+    """
+    signal.pthread_sigmask(signal.SIG_BLOCK, HANDLED)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, HANDLED)

@@ -9,6 +9,7 @@ storage is not a folder of this machine.
 """
 
 import fcntl
+import itertools
 import os
 import shutil
 import time
@@ -24,6 +25,7 @@ from splatmill_worker.service.disk_reserve import shortage
 from splatmill_worker.service.own_copy import link_or_copy
 from splatmill_worker.service.staging import Report, fetch, is_whole, stage
 from splatmill_worker.settings import work_folder
+from splatmill_worker.tiles.folder import TILES
 
 LOCK_SECONDS = 10.0
 """Seconds to wait for the folder's lock, which a process that is being killed still holds for a moment."""
@@ -59,10 +61,14 @@ class JobFolder:
         self.storage = storage
         self.job_id = job_id
         self.capture_id = capture_id
-        self.path = work_folder(job_id)
+        self.path, self._lock = self._opened()
         self.capture = self.path / "capture"
         self.run = self.path / "run"
-        self._lock = _locked_folder(self.path)
+
+    def _opened(self) -> tuple[Path, int]:
+        """The folder, and the descriptor of its lock."""
+        path = work_folder(self.job_id)
+        return path, _locked_folder(path)
 
     def stage_capture(self, report: Report = lambda done, total: None) -> int:
         """Make the capture folder equal to the stored capture; return the number of its files.
@@ -145,19 +151,44 @@ class JobFolder:
 
     def remove(self) -> None:
         """Delete the folder, and what was stored for other machines: the job has ended."""
-        shutil.rmtree(self.path, ignore_errors=True)
         self._delete_stored()
+        shutil.rmtree(self.path, ignore_errors=True)
 
     def reset(self) -> None:
         """Delete what the failed attempt stored, except the recovered cameras, so that a restarted job trains anew."""
+        self._delete_stored()
         for path in self.run.iterdir() if self.run.is_dir() else ():
             if path.name != _CAMERAS:
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
-        self._delete_stored()
 
     def _delete_stored(self) -> None:
-        if self.storage.root is None:
+        # Without a bucket, nothing is stored for other machines but the units of a scene in tiles.
+        if self.storage.root is None or (self.run / TILES).exists():
             self.storage.delete_prefix(layout.job_work(self.job_id))
+
+
+class TileFolder(JobFolder):
+    """A folder of tiles of a job that another worker has: the capture, and what units have made.
+
+    It is one of several, `work/{job}_1` and so on, as many as processes on this machine do tiles of the job at a time.
+    It is kept for the next tile.
+    """
+
+    def _opened(self) -> tuple[Path, int]:
+        for number in itertools.count(1):
+            path = work_folder(f"{self.job_id}_{number}")
+            with suppress(FolderInUse):
+                return path, _locked_folder(path, seconds=0.0)
+        raise AssertionError("count has no end")
+
+    def remove(self) -> None:
+        """Delete the folder: the job has ended."""
+        shutil.rmtree(self.path, ignore_errors=True)
+
+
+def tile_folders(job_id: str) -> list[Path]:
+    """The folders on this machine of tiles of a job that another worker has."""
+    return sorted(work_folder(job_id).parent.glob(f"{job_id}_*"))
 
 
 def remove_remade(folder: Path) -> bool:
@@ -199,7 +230,7 @@ def hold(folder: Path, seconds: float = 0.0) -> Iterator[bool]:
         os.close(descriptor)
 
 
-def _locked_folder(folder: Path) -> int:
+def _locked_folder(folder: Path, seconds: float = LOCK_SECONDS) -> int:
     """Make a folder if there is none, lock it, and return the descriptor of its lock.
 
     A folder that is being removed is waited for, and made anew.
@@ -207,17 +238,17 @@ def _locked_folder(folder: Path) -> int:
     while True:
         folder.mkdir(parents=True, exist_ok=True)
         with suppress(FileNotFoundError):
-            descriptor = _locked(folder / "lock")
+            descriptor = _locked(folder / "lock", seconds)
             if os.fstat(descriptor).st_nlink:
                 return descriptor
             os.close(descriptor)
 
 
-def _locked(path: Path) -> int:
+def _locked(path: Path, seconds: float) -> int:
     """Lock a file exclusively and return its descriptor. The lock ends when that is closed, also by a kill."""
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT, 0o644)
     path.touch()  # its modification time is the start of the last attempt
-    if not _acquired(descriptor, LOCK_SECONDS):
+    if not _acquired(descriptor, seconds):
         os.close(descriptor)
         raise FolderInUse(path.parent)
     return descriptor

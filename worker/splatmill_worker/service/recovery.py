@@ -19,7 +19,7 @@ from rq.worker_registration import get_keys
 from splatmill.backplane import keys
 from splatmill.backplane.process import ProcessIdentity, wait_gone
 from splatmill.backplane.queue import leases, lines, rq_keys
-from splatmill.backplane.queue.entries import split_rq_id
+from splatmill.backplane.queue.entries import split_rq_id, tile_of
 from splatmill.backplane.queue.leases import Lease
 from splatmill_worker.service.attempts.attempt import Attempt
 from splatmill_worker.service.lock import Holder, JobLock
@@ -112,7 +112,8 @@ def _requeue_if_orphaned(worker: Worker, lease: Lease) -> None:
     connection = worker.connection
     job_id, _ = split_rq_id(lease.entry)
     lock = JobLock(connection, job_id, token="")
-    holder = lock.holder()
+    is_tile = tile_of(lease.entry) is not None
+    holder = None if is_tile else lock.holder()  # a worker that does a tile has no lock on the job
     try:
         owner = Execution.fetch(lease.execution, lease.entry, connection).worker_name
         orphaned = bool(_dead_workers(connection, [worker.redis_worker_namespace_prefix + owner]))
@@ -122,7 +123,7 @@ def _requeue_if_orphaned(worker: Worker, lease: Lease) -> None:
     if not orphaned or not (holder is None or _has_ended(holder)):
         return
     ended = ended_attempt(connection, lease.entry, lock, holder)
-    if leases.requeue(connection, lease, if_expired=False) == "waiting":
+    if leases.requeue(connection, lease, if_expired=False) == "waiting" and not is_tile:
         ended.report_requeued("The worker ended during this attempt. The job was put back into the queue.")
 
 

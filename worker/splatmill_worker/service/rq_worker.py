@@ -11,8 +11,8 @@ import select
 import signal
 import socket
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from types import FrameType
 from typing import Any, Literal, TypeVar, cast
 from uuid import uuid4
@@ -49,6 +49,7 @@ from splatmill_worker.service.process_exit import (
     oom_kill_count,
 )
 from splatmill_worker.service.saved_progress import SavedProgress
+from splatmill_worker.service.units.run_tile import TileEntry, run_tile
 
 STOP_GRACE = 50.0
 """Seconds that an attempt has to save its state, in storage too, when the worker is told to stop. Then it is killed,
@@ -65,7 +66,6 @@ _SPACE_SECONDS = 1.0  # between two checks of a disk that is full
 _LOG_SECONDS = 30.0  # between two log lines about a Redis that does not work
 _REMOVAL_INTERVAL = 300.0  # half as long as Redis knows that a job was deleted
 _IDLE_SECONDS = 5.0
-_SIGNALS = {signal.SIGTERM, signal.SIGINT, hand_back.SIGNAL}
 
 
 class AttemptEntry(entries.QueueEntry):
@@ -76,13 +76,18 @@ class AttemptEntry(entries.QueueEntry):
 
     attempt: the attempt at the job, set in its process before it runs.
     load: returns the pipeline that the attempt runs, set with it.
+    tile: the tile that is to be done instead.
     """
 
     attempt: Attempt | None = None
     load: LoadPipeline | None = None
+    tile: TileEntry | None = None
 
     def func(self, *args: object, **kwargs: object) -> None:
         """Run the attempt. RQ calls this in place of the named function, with the entry's arguments."""
+        if self.tile is not None:
+            run_tile(self.tile)
+            return
         assert self.attempt is not None
         assert self.load is not None
         run_attempt(self.attempt, self.load, can_retry=self.should_retry)
@@ -395,11 +400,12 @@ class AttemptWorker(Worker):
 
     def fork_work_horse(self, job: Job, queue: Queue) -> None:
         job_id, _ = entries.split_rq_id(job.id)
-        self._lock = JobLock(self.connection, job_id, uuid4().hex)
-        self._saved = SavedProgress(job_id)
+        is_tile = entries.tile_of(job.id) is not None
+        self._lock = None if is_tile else JobLock(self.connection, job_id, uuid4().hex)
+        self._saved = None if is_tile else SavedProgress(job_id)
         parent = os.getpid()
         # Until the child has set up its own handlers, a signal would run those of the worker in the child.
-        with _blocked_signals():
+        with hand_back.blocked_signals():
             child = os.fork()
             if child == 0:
                 try:
@@ -408,7 +414,7 @@ class AttemptWorker(Worker):
                     die_first()
                     signal.set_wakeup_fd(-1)
                     hand_back.install_signal_handlers()
-                    signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
+                    signal.pthread_sigmask(signal.SIG_UNBLOCK, hand_back.HANDLED)
                     self._run_child(job, queue)
                 finally:
                     os._exit(1)
@@ -421,13 +427,17 @@ class AttemptWorker(Worker):
 
     def _run_child(self, job: Job, queue: Queue) -> None:
         """Run the attempt in the forked process, and exit with its status."""
-        assert self._lock is not None
         assert isinstance(job, AttemptEntry)
         try:
-            job.load = self._load
-            job.attempt = start_attempt(self.connection, job.id, self._lock.token)
-            log_lines.bind(attempt=job.attempt.number)
-            self.log.info("Worker %s: attempt %d at %s begins", self.name, job.attempt.number, job.id)
+            if self._lock is None:
+                job.tile = TileEntry(
+                    self.connection, *entries.split_rq_id(job.id), entries.tile_of(job.id) or 0
+                )
+            else:
+                job.load = self._load
+                job.attempt = start_attempt(self.connection, job.id, self._lock.token)
+                log_lines.bind(attempt=job.attempt.number)
+                self.log.info("Worker %s: attempt %d at %s begins", self.name, job.attempt.number, job.id)
             self.main_work_horse(job, queue)
         except HandedBack:
             os._exit(HANDED_BACK_STATUS)
@@ -505,7 +515,8 @@ class AttemptWorker(Worker):
 
         Return in a word how it ended.
         """
-        assert self._lock is not None
+        if self._lock is None:
+            return self._settle_tile(job, queue, process_exit)
         holder = self._lock.holder()
         ours = holder if holder and holder.token == self._lock.token else None
         ended = recovery.ended_attempt(self.connection, job.id, self._lock, ours)
@@ -547,6 +558,22 @@ class AttemptWorker(Worker):
             self.handle_job_failure(job, queue, exc_string=f"The process {process_exit.cause}.")
         return "crashed"
 
+    def _settle_tile(self, job: Job, queue: Queue, process_exit: ProcessExit) -> AttemptEnd:
+        """Update the queue entry of a tile, unless its process has done so. The attempt that has the job reports."""
+        if process_exit.clean:
+            return "reported"
+        if self._superseded or not Job.exists(job.id, self.connection):
+            return "superseded"
+        if job.get_status() is not JobStatus.STARTED:
+            return "reported"
+        if process_exit.handed_back or self._stop_requested:
+            recovery.hand_back(self, self._lease)
+            return "handed_back"
+        if process_exit.withdrawn or self._exceeded is not None:
+            job.retries_left = 0
+        self.handle_job_failure(job, queue, exc_string=f"The process {process_exit.cause}.")
+        return "stopped" if process_exit.withdrawn else "crashed" if self._exceeded is None else "limited"
+
     def _until_redis_works(self, action: Callable[[], T]) -> T:
         """Return the result of `action`, which is repeated while Redis cannot be reached or refuses.
 
@@ -564,15 +591,3 @@ class AttemptWorker(Worker):
                 if self.get_state() != WorkerStatus.BUSY:
                     self._end_if_stopping()
                 time.sleep(_RETRY_SECONDS)
-
-
-@contextmanager
-def _blocked_signals() -> Iterator[None]:
-    """Keep the signals that a worker handles from this thread, and from the process that it forks, until the end of the
-    block. Another thread may receive them meanwhile; the worker's handlers then run here all the same.
-    """
-    signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)

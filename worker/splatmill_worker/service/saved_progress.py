@@ -4,10 +4,11 @@ from pathlib import Path
 
 from splatmill_worker.service.job_folder import CHECKPOINTS
 from splatmill_worker.settings import work_folder
+from splatmill_worker.tiles.folder import DONE, TILES, UNITS
 
 
 class SavedProgress:
-    """The checkpoints of one attempt, from before its process begins.
+    """The checkpoints of one attempt and the units of its scene in tiles, from before its process begins.
 
     A job that this machine has no folder of may begin with a download of the last checkpoint, which is no progress:
     the first one to appear is then not counted.
@@ -15,7 +16,7 @@ class SavedProgress:
 
     def __init__(self, job_id: str) -> None:
         run = work_folder(job_id) / "run"
-        self._folder = run / CHECKPOINTS
+        self._run = run
         self._may_download = not run.is_dir()
         self._seen = self._newest()
 
@@ -29,8 +30,9 @@ class SavedProgress:
         return not downloaded
 
     def _newest(self) -> int:
-        """Return the newest modification time of a checkpoint in nanoseconds; 0 without one."""
-        return max((_modified(path) for path in self._folder.glob("[!.]*")), default=0)
+        """Return the newest modification time of a checkpoint or unit in nanoseconds; 0 without one."""
+        saved = [*(self._run / CHECKPOINTS).glob("[!.]*"), *(self._run / TILES / UNITS).glob(f"[!.]*/{DONE}")]
+        return max(map(_modified, saved), default=0)
 
 
 def _modified(path: Path) -> int:

@@ -20,28 +20,21 @@ from splatmill.schema import (
     Event,
     LogEvent,
     ProgressEvent,
-    ProgressVideo,
-    Switch,
     TrainOptions,
     format_duration,
 )
 from splatmill.schema.quantities import listed
-from splatmill_worker.errors import (
-    Cancelled,
-    FailureName,
-    Refusal,
-    SfmFailed,
-    TrainingFailed,
-    WorkerError,
-)
+from splatmill_worker.errors import Cancelled, Refusal, WorkerError
 from splatmill_worker.tiles.folder import SCENE, Claimed, PlanFolder, digest_of, facts_of
+from splatmill_worker.tiles.retrying import may_pass
 from splatmill_worker.tiles.units import ScenePlan
 
 REFUSED, FAILED, UNWRITABLE, STOPPED, CLAIMED, BROKEN = 5, 3, 1, 130, 75, 70
 """Exit statuses, those of the command line: the plan or its photos cannot be used; a unit failed; a folder could not be
 written; Ctrl-C; another process runs the unit; a unit ended in a way that another attempt may not."""
 
-MOST_TILES = 1024
+ENDED = "ended_decoders.json"
+"""File in a work folder that names the photos which end the process that decodes them."""
 
 POLL_SECONDS = 2.0
 """Time between two looks for units, while other processes run those that the next ones need."""
@@ -57,13 +50,14 @@ LINE_SECONDS = 5.0
 """Time between two lines of progress."""
 
 
-def make_plan(root: Path, capture: Path, options: str, tiles: int) -> int:
+def make_plan(root: Path, capture: Path, options: str) -> int:
     """Write the plan of the folder `capture`, which is moved into `root`; returns the exit status.
 
-    options: TrainOptions as JSON. Where the plan is refused, `capture` is removed, and an earlier plan stays as it is.
+    options: TrainOptions with tiles, as JSON. Where the plan is refused, `capture` is removed, and an earlier plan
+        stays as it is.
     """
     try:
-        return _reported(lambda: _make_plan(root, capture, TrainOptions.model_validate_json(options), tiles))
+        return _reported(lambda: _make_plan(root, capture, TrainOptions.model_validate_json(options)))
     finally:
         shutil.rmtree(capture, ignore_errors=True)
 
@@ -105,9 +99,8 @@ def _reported(run: Callable[[], int]) -> int:
         return STOPPED
 
 
-def _make_plan(root: Path, capture: Path, options: TrainOptions, tiles: int) -> int:
-    _check(options, tiles)
-    folder = PlanFolder(root, ScenePlan(digest_of(capture), options, tiles))
+def _make_plan(root: Path, capture: Path, options: TrainOptions) -> int:
+    folder = PlanFolder(root, ScenePlan(digest_of(capture), options))
     if not folder.capture.exists():
         folder.capture.parent.mkdir(parents=True, exist_ok=True)
         capture.rename(folder.capture)
@@ -121,32 +114,9 @@ def _make_plan(root: Path, capture: Path, options: TrainOptions, tiles: int) -> 
     return 0
 
 
-def _check(options: TrainOptions, tiles: int) -> None:
-    """Raise Refusal for what units do not do."""
-    if not 2 <= tiles <= MOST_TILES:
-        raise Refusal(
-            "option_out_of_range",
-            f"tiles is {tiles}; a scene is divided into 2 to {MOST_TILES} tiles.",
-            advice="Train a scene in one piece with splatmill train.",
-        )
-    given = {
-        "time_budget": options.time_budget is not None,
-        "within": options.within is not None,
-        "progress_video": options.progress_video is not ProgressVideo.off,
-        "time_lapse": options.time_lapse is Switch.on,
-        "start": options.start is not None,
-    }
-    for name in (name for name, is_given in given.items() if is_given):
-        raise Refusal(
-            "option_out_of_range",
-            f"The option {name} is for a training in one piece: the units of a plan run on several machines, each to "
-            "the end of its steps.",
-            advice=f"Leave out {name}; preset and steps say how long each unit trains.",
-        )
-
-
 def _do_one(root: Path, name: str) -> int:
     """Do one unit in this process."""
+    from splatmill_worker.images.decoding import decoders
     from splatmill_worker.tiles.stages import Context, run_unit
 
     folder = PlanFolder.open(root)
@@ -180,13 +150,16 @@ def _do_one(root: Path, name: str) -> int:
             if _is_done(folder, name):  # by a process that was faster
                 return 0
             try:
-                run_unit(Context(folder, run, _Lines(name), lambda: stopped.asked or not run.held()))
+                context = Context(folder, run, _Lines(name), lambda: stopped.asked or not run.held())
+                readable = [folder.capture.resolve(), run.work.resolve()]
+                with decoders.confined(readable, run.work / ENDED, context.cancelled):
+                    run_unit(context)
             except Exception as error:
                 if stopped.asked:
                     raise Cancelled from error
                 if not run.owned():
                     raise Claimed from error
-                if isinstance(error, WorkerError) and not _may_pass(error):
+                if isinstance(error, WorkerError) and not may_pass(error):
                     run.fail(error.message, error.advice or "")
                     raise
                 if isinstance(error, WorkerError):
@@ -213,13 +186,6 @@ def _is_done(folder: PlanFolder, name: str) -> bool:
         _link_scene(folder.root, ended.path)
     print(f"{name} is done already.")
     return True
-
-
-def _may_pass(error: WorkerError) -> bool:
-    """Whether another machine, or this one at another time, may do a unit that ended with this error."""
-    if isinstance(error, TrainingFailed):
-        return error.name is FailureName.memory
-    return error.code == "backend_unavailable" or not isinstance(error, Refusal | SfmFailed)
 
 
 def _do_all(root: Path) -> int:

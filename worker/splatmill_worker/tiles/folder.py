@@ -22,6 +22,9 @@ from splatmill_worker.tiles.units import ScenePlan, State
 PLAN, CAPTURES, UNITS, SCENE = "plan.json", "captures", "units", "scene"
 """The plan, captures by their digests, the outputs of the units, and a link to the output of the last one."""
 
+TILES = "tiles"
+"""Folder of the plan in the folder of a run that trains its scene in tiles."""
+
 CLAIM_SECONDS = 60.0
 """Age of a claim from which its process counts as gone."""
 
@@ -91,6 +94,24 @@ class PlanFolder:
     def capture(self) -> Path:
         """The folder of the photos. That of another capture has another name, so that none changes under a unit."""
         return self.root / CAPTURES / self.plan.digest[:16]
+
+    def place(self, capture: Path) -> None:
+        """Let the folder of the photos be a link to `capture`."""
+        self.capture.parent.mkdir(parents=True, exist_ok=True)
+        if not self.capture.is_symlink():
+            self.capture.symlink_to(capture.resolve(), target_is_directory=True)
+
+    def release(self) -> None:
+        """Remove what earlier processes left that ended in the middle of a unit. The caller knows that none runs."""
+        for path in (self.root / UNITS).glob("*"):
+            if path.suffix == ".work":
+                shutil.rmtree(path, ignore_errors=True)
+            elif path.suffix == ".claim":
+                path.unlink(missing_ok=True)
+
+    def output(self, name: str) -> Path:
+        """The folder that the output of a unit will have, by what has ended so far."""
+        return self._path(name, self.states())
 
     def states(self) -> dict[str, State]:
         """The units that have ended, by name."""

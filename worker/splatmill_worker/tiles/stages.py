@@ -10,13 +10,13 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from splatmill.schema import Backend, TrainOptions
-from splatmill_worker.images.decoding import decoders
+from splatmill.schema import Backend, PlanEvent, Switch, TrainOptions
 from splatmill_worker.images.load import training_size
 from splatmill_worker.pipeline.cameras import Cameras, recover_cameras
 from splatmill_worker.pipeline.events import Emit
 from splatmill_worker.pipeline.first_gaussians import seeded
 from splatmill_worker.pipeline.job import Job, choose_kernels
+from splatmill_worker.pipeline.live import Looks
 from splatmill_worker.pipeline.planning import plan_training, planned_photos
 from splatmill_worker.pipeline.stage_times import Stages
 from splatmill_worker.pipeline.training import train_scene
@@ -28,13 +28,10 @@ from splatmill_worker.tiles import coarse_model, joined
 from splatmill_worker.tiles.cells import divide
 from splatmill_worker.tiles.folder import PlanFolder, Run, facts_of
 from splatmill_worker.tiles.tile import Tile, train_tile
-from splatmill_worker.tiles.units import ScenePlan
+from splatmill_worker.tiles.units import ScenePlan, tile_name, tile_number
 
 STEPS_SHARE = 0.5
 """Share of the steps of a whole run that the coarse model takes, and that each tile takes after it."""
-
-ENDED = "ended_decoders.json"
-"""File in a work folder that names the photos which end the process that decodes them."""
 
 SFM = "sfm"
 """Folder of the recovered cameras in a work folder, and in the output of the unit `cameras`."""
@@ -48,12 +45,19 @@ class Context:
     run: the unit that this process holds.
     emit: called with each event.
     cancelled: polled; the unit ends with Cancelled when it returns true.
+    looks: those of onlookers, who see cameras and the coarse model; None where there are none.
+    known: folder of cameras that were recovered before, from which the unit `cameras` begins; None without.
+    checkpoints: folder for the checkpoints of the unit, from which another run of it continues; None: they go with the
+        run.
     """
 
     folder: PlanFolder
     run: Run
     emit: Emit
     cancelled: Callable[[], bool]
+    looks: Looks | None = None
+    known: Path | None = None
+    checkpoints: Path | None = None
 
     def job(self, options: TrainOptions) -> Job:
         """A job in the work folder of the unit, which has the recovered cameras there are.
@@ -64,12 +68,18 @@ class Context:
         work = self.run.work
         work.joinpath("out").mkdir(exist_ok=True)
         cameras = self.folder.ended().get("cameras")
-        if cameras is not None and cameras.path is not None and (cameras.path / SFM).is_dir():
-            shutil.copytree(cameras.path / SFM, work / SFM, dirs_exist_ok=True)
+        known = self.known if cameras is None or cameras.path is None else cameras.path / SFM
+        if known is not None and known.is_dir():
+            shutil.copytree(known, work / SFM, dirs_exist_ok=True)
+        if self.checkpoints is not None:
+            self.checkpoints.mkdir(exist_ok=True)
+            work.joinpath(self.checkpoints.name).symlink_to(self.checkpoints, target_is_directory=True)
         kernels: Kernels = "reference" if options.backend is Backend.reference else "cpu"
         if self.run.name == "coarse":
             kernels = choose_kernels(options)
-        return Job(self.folder.capture, work, options, kernels, self.emit, self.cancelled, looks=None)
+        looks = self.looks if self.run.name in ("cameras", "coarse") else None
+        options = options.model_copy(update={"time_lapse": Switch.off})
+        return Job(self.folder.capture, work, options, kernels, self.emit, self.cancelled, looks)
 
     def output(self, unit: str) -> Path:
         """The folder of the output of a unit that is done."""
@@ -79,19 +89,20 @@ class Context:
 
 
 def run_unit(context: Context) -> None:
-    """Do the unit that `context` holds, and publish its output. Raises WorkerError for what would fail again."""
+    """Do the unit that `context` holds, and publish its output. The caller confines decoders.
+
+    Raises Cancelled, and WorkerError.
+    """
     name, started = context.run.name, time.perf_counter()
     stages = Stages(context.run.work / "stages.json")
-    readable = [context.folder.capture.resolve(), context.run.work.resolve()]
-    with decoders.confined(readable, context.run.work / ENDED, context.cancelled):
-        if name == "cameras":
-            facts = _cameras(context, stages)
-        elif name == "coarse":
-            facts = _coarse(context, stages)
-        elif name == "scene":
-            facts = joined.write_scene(_joining(context, stages))
-        else:
-            facts = _tile(context, stages)
+    if name == "cameras":
+        facts = _cameras(context, stages)
+    elif name == "coarse":
+        facts = _coarse(context, stages)
+    elif name == "scene":
+        facts = joined.write_scene(_joining(context, stages))
+    else:
+        facts = _tile(context, stages)
     context.run.publish({"seconds": round(time.perf_counter() - started, 1), **facts})
 
 
@@ -117,8 +128,9 @@ def _coarse(context: Context, stages: Stages) -> dict[str, Any]:
     most = _most(cameras, job)
     job = replace(job, options=_coarse_options(plan, most))
     planned = plan_training(job, cameras, _shorter, stages)
-    photos = planned_photos(cameras, planned, stages)
     decided = planned.plan
+    context.emit(PlanEvent(plan=decided.as_dict()))
+    photos = planned_photos(cameras, planned, stages)
     engine = open_engine(
         seeded(planned.first, cameras, photos, decided), decided.kernels, clustered=decided.cluster_culling
     )
@@ -144,7 +156,7 @@ def _coarse(context: Context, stages: Stages) -> dict[str, Any]:
 
 
 def _tile(context: Context, stages: Stages) -> dict[str, Any]:
-    number = int(context.run.name.removeprefix("tile-"))
+    number = tile_number(context.run.name)
     job = context.job(context.folder.plan.options)
     coarse = coarse_model.read(context.output("coarse"))
     context.run.out.mkdir(exist_ok=True)
@@ -165,7 +177,7 @@ def _joining(context: Context, stages: Stages) -> joined.Joining:
     job = context.job(_coarse_options(context.folder.plan, coarse.most))
     tiles = []
     for number in range(len(coarse.cells)):
-        tile = ended[f"tile-{number + 1}"]
+        tile = ended[tile_name(number + 1)]
         facts = {} if tile.path is None else facts_of(tile.path)
         tiles.append(joined.TrainedTile(tile.path, facts, tile.failure))
     return joined.Joining(job, stages, coarse, tuple(tiles), facts_of(context.output("coarse")))

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from splatmill.schema import TrainOptions
 
-FORMAT = 1
+FORMAT = 2
 """Version of the plan's format and of what its units make: another one makes everything anew."""
 
 CAMERA_OPTIONS = ("sfm_effort", "matcher", "mapper", "max_video_frames", "scale", "seed", "start")
@@ -38,18 +38,31 @@ class ScenePlan:
     """What the units of a scene follow from.
 
     digest: of the files of the capture.
-    options: of the training.
-    tiles: how many parts the scene is trained in.
+    options: of the training, with the number of tiles.
     """
 
     digest: str
     options: TrainOptions
-    tiles: int
+
+    def __post_init__(self) -> None:
+        if self.options.tiles is None:
+            raise ValueError("Its options have no number of tiles.")
+
+    @property
+    def tiles(self) -> int:
+        """How many parts the scene is trained in."""
+        assert self.options.tiles is not None
+        return self.options.tiles
+
+    @property
+    def tile_names(self) -> tuple[str, ...]:
+        """The units that train the tiles. They need no other's output but those of the cameras and the coarse model."""
+        return tuple(tile_name(number) for number in range(1, self.tiles + 1))
 
     @property
     def units(self) -> tuple[Unit, ...]:
         """All units, each after those that it needs."""
-        tiles = tuple(f"tile-{number}" for number in range(1, self.tiles + 1))
+        tiles = self.tile_names
         return (
             Unit("cameras"),
             Unit("coarse", ("cameras",)),
@@ -71,7 +84,7 @@ class ScenePlan:
         if name == "cameras":
             own["options"] = {option: options[option] for option in CAMERA_OPTIONS}
         else:
-            own |= {"options": options, "tiles": self.tiles}
+            own["options"] = options
             own["failed"] = [need for need in self.unit(name).optional if states.get(need) == "failed"]
         return hashlib.sha256(json.dumps(own, sort_keys=True).encode()).hexdigest()[:16]
 
@@ -98,7 +111,6 @@ class ScenePlan:
             "format": FORMAT,
             "digest": self.digest,
             "options": self.options.model_dump(mode="json"),
-            "tiles": self.tiles,
         }
 
     @staticmethod
@@ -106,9 +118,17 @@ class ScenePlan:
         """The plan of `as_dict`. Raises ValueError for another format, and KeyError or TypeError for other fields."""
         if values["format"] != FORMAT:
             raise ValueError(f"It has format {values['format']}, and this version reads format {FORMAT}.")
-        return ScenePlan(
-            str(values["digest"]), TrainOptions.model_validate(values["options"]), int(values["tiles"])
-        )
+        return ScenePlan(str(values["digest"]), TrainOptions.model_validate(values["options"]))
+
+
+def tile_name(number: int) -> str:
+    """The name of the unit that trains a tile. number: from 1."""
+    return f"tile-{number}"
+
+
+def tile_number(name: str) -> int:
+    """The number of the tile that the unit `name` trains, from 1."""
+    return int(name.removeprefix("tile-"))
 
 
 def _unknown(name: str) -> Unit:

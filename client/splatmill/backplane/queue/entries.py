@@ -1,7 +1,8 @@
 """The entries of the job queue: RQ's records, and all settings that differ from RQ's defaults.
 
-An entry is one generation of a Splatmill job, and each run of it is an attempt. The server does not import the worker:
-which function runs an attempt is decided there.
+An entry is one generation of a Splatmill job, and each run of it is an attempt. Where a scene is trained in tiles, its
+attempt adds an entry for each, which other workers may take. The server does not import the worker: which function runs
+an attempt or a tile is decided there.
 """
 
 import redis
@@ -43,6 +44,10 @@ KEEP_FINISHED = 24 * 3600
 """Seconds for which RQ keeps its record of a finished job. Splatmill's own stays until the job is deleted."""
 
 
+KEEP_TILES = 60
+"""Seconds for which RQ keeps its record of a tile that has ended: what the tile made is in storage by then."""
+
+
 class QueueEntry(Job):
     """RQ's record of one generation of a job, without callbacks, which RQ would import by names found in Redis."""
 
@@ -67,9 +72,28 @@ def rq_id(job_id: str, generation: int) -> str:
     return f"{job_id}-{generation}"
 
 
+def unit_id(job_id: str, generation: int, tile: int) -> str:
+    """Return RQ's id of a tile, from 1, of a generation whose scene is trained in tiles."""
+    return f"{rq_id(job_id, generation)}_{tile}"
+
+
 def split_rq_id(text: str) -> tuple[str, int]:
-    """Return the job id and the generation in an id of RQ. Raises ValueError for an id of another form."""
-    job_id, _, generation = text.rpartition("-")
+    """Return the job id and the generation in an id of RQ, also in that of a tile.
+
+    Raises ValueError for an id of another form.
+    """
+    job_id, _, generation = _whole(text).rpartition("-")
     if not job_id or not generation.isdigit():
         raise ValueError(f"{text!r} is not '<job id>-<generation>'.")
     return job_id, int(generation)
+
+
+def tile_of(text: str) -> int | None:
+    """Return the tile in an id of RQ; None for the id of a generation."""
+    return None if _whole(text) == text else int(text.rpartition("_")[2])
+
+
+def _whole(text: str) -> str:
+    """The id of the generation, for the id of one of its tiles."""
+    head, _, tile = text.rpartition("_")
+    return head if tile.isdigit() and head.rpartition("-")[2].isdigit() else text

@@ -33,6 +33,11 @@ local function wanted_line(options)
   return 'any'
 end
 
+-- '<job>-<generation>', or for a tile '<job>-<generation>_<tile>'
+local function job_of(entry)
+  return string.match(entry, '^(.+)%-%d+$$') or string.match(entry, '^(.+)%-%d+_%d+$$')
+end
+
 local function leave(entry)
   local place = redis.call('HGET', places, entry)
   if not place then return 0 end
@@ -62,7 +67,7 @@ end
 local foreign = {}
 while redis.call('LLEN', inbox) > 0 do  -- a Redis that refuses writes refuses to pop from an empty list as well
   local entry = redis.call('LPOP', inbox)
-  local job = string.match(entry, '^(.+)%-%d+$$')
+  local job = job_of(entry)
   if job then queue_up(entry, job, redis.call('HDEL', records .. entry, 'splatmill_front') == 1)
   else
     redis.call('DEL', records .. entry)
@@ -153,7 +158,7 @@ HAND_BACK = (
 if redis.call('ZREM', leases, ARGV[1]) == 0 then return {foreign, 0} end
 redis.call('DEL', executions .. ARGV[1])
 redis.call('HSET', records .. ARGV[2], 'status', 'queued', 'worker_name', '')
-queue_up(ARGV[2], string.match(ARGV[2], '^(.+)%-%d+$'), true)
+queue_up(ARGV[2], job_of(ARGV[2]), true)
 return {foreign, 1}
 """
 )

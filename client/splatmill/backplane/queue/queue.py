@@ -14,16 +14,18 @@ from rq.command import send_stop_job_command
 from rq.exceptions import DuplicateJobError, InvalidJobOperation, NoSuchJobError
 from rq.job import Job, JobStatus
 
-from splatmill.backplane.queue import lines
+from splatmill.backplane.queue import leases, lines
 from splatmill.backplane.queue.entries import (
     ATTEMPT,
     JOB_TIMEOUT,
     KEEP_FINISHED,
+    KEEP_TILES,
     MAX_RETRIES,
     SERIALIZER,
     QueueEntry,
     open_queue,
     rq_id,
+    unit_id,
 )
 
 QueueState = Literal["waiting", "running", "finished", "failed", "stopped", "absent"]
@@ -61,15 +63,23 @@ def enqueue(connection: redis.Redis, job_id: str, generation: int) -> bool:
 
     Return False if the queue already has it, so two callers cannot enqueue it twice.
     """
+    return _enqueue(connection, job_id, rq_id(job_id, generation), result_ttl=KEEP_FINISHED)
+
+
+def _enqueue(
+    connection: redis.Redis, job_id: str, entry: str, result_ttl: int, failure_ttl: int | None = None
+) -> bool:
+    """result_ttl, failure_ttl: seconds for which RQ keeps the record of an entry that has ended."""
     try:
         open_queue(connection).enqueue_call(
             ATTEMPT,
             args=[job_id],
-            job_id=rq_id(job_id, generation),
+            job_id=entry,
             timeout=JOB_TIMEOUT,
-            result_ttl=KEEP_FINISHED,
+            result_ttl=result_ttl,
+            failure_ttl=failure_ttl,
             retry=Retry(max=MAX_RETRIES),
-            description=f"job {job_id}, generation {generation}",
+            description=f"entry {entry} of job {job_id}",
             unique=True,
         )
     except DuplicateJobError:
@@ -79,9 +89,33 @@ def enqueue(connection: redis.Redis, job_id: str, generation: int) -> bool:
     return True
 
 
+def offer_tile(connection: redis.Redis, job_id: str, generation: int, tile: int) -> bool:
+    """Let any worker take a tile of a scene: append it to the line of its job. Return False if the queue has it."""
+    entry = unit_id(job_id, generation, tile)
+    return _enqueue(connection, job_id, entry, result_ttl=KEEP_TILES, failure_ttl=KEEP_TILES)
+
+
+def take_back_tile(connection: redis.Redis, job_id: str, generation: int, tile: int) -> bool:
+    """Take a tile out of the queue. Return False if a worker has it; then that has ended, or its lease will expire."""
+    entry = unit_id(job_id, generation, tile)
+    if lines.withdraw(connection, entry):
+        return True
+    record = _record(connection, entry)
+    if record is None or _STATES.get(record.get_status(refresh=False)) in ("finished", "failed", "stopped"):
+        return True
+    # Redis may have lost the lease and not the record.
+    return leases.drop_unheld(connection, entry)
+
+
+def withdraw_tiles(connection: redis.Redis, job_id: str, generation: int, tiles: int | None) -> None:
+    """Remove the waiting tiles of a generation from the queue. tiles: their number; None for a scene in one piece."""
+    for tile in range(1, (tiles or 0) + 1):
+        lines.withdraw(connection, unit_id(job_id, generation, tile))
+
+
 def status(connection: redis.Redis, job_id: str, generation: int) -> QueueStatus:
     """Return what the queue knows about a generation."""
-    job = _fetch(connection, job_id, generation)
+    job = _record(connection, rq_id(job_id, generation))
     if job is None:
         return QueueStatus("absent")
     state = _STATES.get(job.get_status(refresh=False), "waiting")
@@ -121,14 +155,14 @@ def stop(connection: redis.Redis, job_id: str, generation: int) -> bool:
 def forget(connection: redis.Redis, job_id: str, generation: int) -> None:
     """Delete RQ's record of a generation that has ended."""
     lines.withdraw(connection, rq_id(job_id, generation))
-    job = _fetch(connection, job_id, generation)
+    job = _record(connection, rq_id(job_id, generation))
     if job is not None:
         job.delete()
 
 
-def _fetch(connection: redis.Redis, job_id: str, generation: int) -> Job | None:
+def _record(connection: redis.Redis, entry: str) -> Job | None:
     try:
-        return QueueEntry.fetch(rq_id(job_id, generation), connection=connection, serializer=SERIALIZER)
+        return QueueEntry.fetch(entry, connection=connection, serializer=SERIALIZER)
     except NoSuchJobError:
         return None
 

@@ -223,6 +223,11 @@ def job_work(job_id: str) -> str:
     return f"jobs/{job_id}/work"
 
 
+def job_units(job_id: str) -> str:
+    """Return the folder of the units of a job that is trained in tiles: its plan, and what its units have made."""
+    return f"{job_work(job_id)}/units"
+
+
 def job_log(job_id: str) -> str:
     """Return the path of the log of a job that has ended. Only the server writes it."""
     return f"jobs/{job_id}/log.jsonl"

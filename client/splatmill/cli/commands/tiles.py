@@ -14,6 +14,9 @@ from splatmill.schema import format_bytes
 from splatmill.transfer.local_capture import LocalFile, find_files, printable
 from splatmill.transfer.training_options import train_options
 
+TILES = 4
+"""Tiles of a plan for which no number is given."""
+
 
 @with_training_options
 def plan(
@@ -31,16 +34,15 @@ def plan(
             "-o", "--out", metavar="DIR", help="Folder of the plan; created if missing.", show_default=False
         ),
     ],
-    tiles: Annotated[int, typer.Option(min=2, help="Number of tiles that the scene is trained in.")] = 4,
     **options: Any,
 ) -> None:
     """Plan a scene in tiles: cameras, a coarse model, tiles, and the model that they make, each a unit in DIR.
 
     `splatmill unit DIR` does the units, on this machine and on every other that sees DIR. A plan that is made again
-    with other options keeps what does not depend on them.
+    with other options keeps what does not depend on them. Without `--tiles`, there are four.
     """
     arguments = {key: value for key, value in options.items() if value is not None and value != []}
-    checked = train_options(arguments)
+    checked = train_options({"tiles": TILES} | arguments)
     capture_files = find_files(path)
     capture_files.refuse_one_photo()
     require("splatmill_worker", "Planning a scene")
@@ -53,8 +55,6 @@ def plan(
         "plan",
         "--capture",
         str(capture),
-        "--tiles",
-        str(tiles),
         "--options",
         checked.model_dump_json(),
         "--",

@@ -48,6 +48,15 @@ PAIRS = [
     {one[0]: one[1], other[0]: other[1]} for one, other in combinations(levels(), 2) if one[0] != other[0]
 ]
 
+IN_ONE_PIECE: dict[str, set[object]] = {
+    "time_budget": {1, 7 * 86400},
+    "within": {5, 7 * 86400},
+    "start": {*MODELS, *POINTS},
+    "progress_video": {"view", "orbit"},
+    "time_lapse": {"on"},
+}
+"""What is for a training in one piece: the plan of a training knows nothing of tiles."""
+
 
 def excluded(given: Mapping[str, Any]) -> set[str]:
     """The names of the options that the schema refuses for each other."""
@@ -66,6 +75,8 @@ def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
 def refused_by_plan(given: Mapping[str, Any]) -> bool:
     """Whether no plan can be made of these options, of photos for which one can be made of each alone."""
     options = TrainOptions.model_validate(given)
+    if "tiles" in given:
+        return any(value in IN_ONE_PIECE.get(name, ()) for name, value in given.items())
     facts = changed(
         sky_share=0.3, seconds_left=options.within, start=MODEL if options.start in MODELS[:-1] else None
     )

@@ -10,6 +10,7 @@ import time
 import traceback
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn, Protocol, cast
 
@@ -249,7 +250,7 @@ def _train(
             decoders.confined([folder.path], folder.run / ENDED, stopped),
             unpacked_room.claimed_by(room.unpack),
         ):
-            result = load()(
+            result = _pipeline(attempt, load, row, folder, room)(
                 folder.capture,
                 folder.run,
                 row.options,
@@ -269,6 +270,17 @@ def _train(
     mirror.close(copy=ended_early)
     if ended_early:
         raise HandedBack if disk.error is None or hand_back.requested() else disk.error
+
+
+def _pipeline(attempt: Attempt, load: LoadPipeline, row: JobRow, folder: JobFolder, room: Room) -> Pipeline:
+    """What does the work of the job: of a scene in tiles, other workers do some."""
+    if row.options.tiles is None:
+        return load()
+    from splatmill_worker.service.units.other_workers import OtherWorkers
+    from splatmill_worker.tiles import job
+
+    others = OtherWorkers(attempt.connection, attempt.job_id, attempt.generation, folder.storage, room)
+    return partial(job.run, others=others)
 
 
 def _forward(event: Event, folder: JobFolder, room: Room, outbox: Outbox) -> None:

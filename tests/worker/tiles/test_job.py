@@ -1,0 +1,149 @@
+"""A job in tiles, unit after unit in one process: which units are done, what is said of them, and what another attempt
+does again.
+
+Does not prove that others find the tiles: tests/service/test_tiles.py does.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import pytest
+
+from splatmill.schema import (
+    CamerasEvent,
+    Event,
+    JobState,
+    LogEvent,
+    MetricEvent,
+    PreviewEvent,
+    ProgressEvent,
+    StateEvent,
+    TrainOptions,
+)
+from splatmill_worker.pipeline import Outcome
+from splatmill_worker.tiles import job
+from splatmill_worker.tiles.folder import PlanFolder
+from splatmill_worker.tiles.stages import Context, run_unit
+from tests.support import still_life
+
+pytestmark = pytest.mark.slow
+
+OPTIONS = TrainOptions.model_validate(
+    {
+        "steps": 100,
+        "seed": 1,
+        "max_gaussians": 2000,
+        "holdout": 5,
+        "tiles": 2,
+        "backend": "cpu",
+        "lpips": "off",
+    }
+)
+
+
+class Play(job.Nobody):
+    """Plays other workers, and records what they are asked.
+
+    at_offer: called with the folder once, before any tile is begun.
+    has: tiles that they have.
+    """
+
+    def __init__(self, at_offer: Callable[[PlanFolder], None] = lambda folder: None, *has: str) -> None:
+        self.has, self.offered, self.stores, self.ended = list(has), list[str](), list[str](), 0
+        self._at_offer = at_offer
+
+    def begin(self, folder: PlanFolder) -> None:
+        self._folder = folder
+
+    def stored(self, output: Path) -> None:
+        self.stores.append(output.name.rpartition("-")[0])
+
+    def offer(self, tiles: Sequence[str]) -> None:
+        if not self.offered:
+            self.offered = list(tiles)
+            self._at_offer(self._folder)
+
+    def take_back(self, tile: str) -> bool:
+        return tile not in self.has
+
+    def gather(self, folder: PlanFolder) -> None:
+        if self.has and "tile-1" in folder.states():
+            with folder.claimed(self.has.pop()) as run:
+                run_unit(Context(folder, run, lambda event: None, lambda: False))
+
+    def end(self) -> None:
+        self.ended += 1
+
+
+def run(
+    tmp_path: Path,
+    others: job.Others,
+    cancelled: Callable[[list[Event]], bool] = lambda events: False,
+) -> tuple[Outcome, list[Event]]:
+    """The outcome and the events of a run in `tmp_path`, which may be one more there."""
+    capture, workdir = tmp_path / "capture", tmp_path / "run"
+    if not capture.exists():
+        still_life.posed_capture(capture)
+    workdir.mkdir(exist_ok=True)
+    events: list[Event] = []
+
+    def emit(event: Event) -> None:
+        events.append(event)
+        if isinstance(event, PreviewEvent | CamerasEvent):
+            assert (workdir / event.path).is_file()
+
+    outcome = job.run(capture, workdir, OPTIONS, emit, lambda: cancelled(events), others=others)
+    return outcome, events
+
+
+def test_units_are_done_in_order_and_stored_and_those_of_others_are_waited_for(tmp_path: Path) -> None:
+    others = Play(lambda folder: None, "tile-2")
+    outcome, events = run(tmp_path, others)
+    assert outcome.ended == "succeeded"
+    assert (others.offered, others.stores, others.ended) == (
+        ["tile-1", "tile-2"],
+        ["cameras", "coarse", "tile-1"],
+        1,
+    )
+    assert [event.state for event in events if isinstance(event, StateEvent)] == [
+        JobState.sfm,
+        JobState.training,
+        JobState.exporting,
+    ]
+    notes = {event.note for event in events if isinstance(event, ProgressEvent)}
+    assert "tile 1 of 2" in notes
+    assert "tile 2 of 2" not in notes
+    report = json.loads((outcome.out / "report.json").read_text())
+    assert report["curve"][-1]["step"] == 150
+    assert (outcome.out / "model.ply").stat().st_size > 0
+    again, events = run(tmp_path, Play())
+    assert (again.ended, events) == ("succeeded", [])
+
+
+def test_a_failed_tile_is_said_and_the_scene_is_made_without_it(tmp_path: Path) -> None:
+    def fail(folder: PlanFolder) -> None:
+        with folder.claimed("tile-1") as run:
+            run.fail("Nothing shows it.", "")
+
+    outcome, events = run(tmp_path, Play(fail))
+    said = [event.message for event in events if isinstance(event, LogEvent) and event.level == "warning"]
+    assert any("Tile 1 of 2 failed" in message and "Nothing shows it." in message for message in said)
+    report = json.loads((outcome.out / "report.json").read_text())
+    assert any("Tile 1 of 2 failed" in warning for warning in report["warnings"])
+
+
+def test_a_coarse_training_that_was_interrupted_continues(tmp_path: Path) -> None:
+    def measured(events: list[Event]) -> set[int]:
+        return {event.step for event in events if isinstance(event, MetricEvent)}
+
+    others = Play()
+    outcome, events = run(tmp_path, others, lambda events: len(measured(events)) >= 3)
+    assert (outcome.ended, others.stores, others.ended) == ("cancelled", ["cameras"], 1)
+    before = measured(events)
+    outcome, events = run(tmp_path, Play())
+    assert outcome.ended == "succeeded"
+    assert max(before) < min(measured(events))
+    assert not (tmp_path / "run" / "checkpoints").exists()

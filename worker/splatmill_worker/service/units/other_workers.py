@@ -1,0 +1,69 @@
+"""Other workers, which do tiles of a job beside the attempt that has it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+
+import redis
+
+from splatmill.backplane.queue import queue
+from splatmill.backplane.storage.storage import Storage
+from splatmill_worker.service.redis_patience import patiently
+from splatmill_worker.service.room import Room
+from splatmill_worker.service.units.stored_units import StoredUnits
+from splatmill_worker.tiles.folder import PlanFolder
+from splatmill_worker.tiles.units import tile_number
+
+
+class OtherWorkers:
+    """The workers of a service, to which the queue gives tiles that the attempt has not begun.
+
+    A tile waits in the queue until a worker takes it, or the attempt takes it back to do it itself. So nobody waits for
+    a worker that does not come, and no tile is done by two unless one of them is lost.
+    """
+
+    def __init__(
+        self, connection: redis.Redis, job_id: str, generation: int, storage: Storage, room: Room
+    ) -> None:
+        self._connection, self._job_id, self._generation = connection, job_id, generation
+        self._room = room
+        self._units = StoredUnits(storage, job_id)
+        self._offered: set[str] = set()
+
+    def begin(self, folder: PlanFolder) -> None:
+        """Store the plan and what this machine has done of it, and bring what earlier attempts have done elsewhere."""
+        self._units.put_plan(folder.plan)
+        self.gather(folder)
+        for ended in folder.ended().values():
+            if ended.path is not None:
+                self.stored(ended.path)
+
+    def stored(self, output: Path) -> None:
+        """Store the output of a unit."""
+        self._units.put(output, self._room.store)
+
+    def offer(self, tiles: Sequence[str]) -> None:
+        """Put tiles into the queue, each once."""
+        for name in tiles:
+            if name not in self._offered:
+                self._offered.add(name)
+                patiently(partial(self._on, queue.offer_tile, name))
+
+    def take_back(self, tile: str) -> bool:
+        """Take a tile out of the queue; returns whether no other worker has it."""
+        return patiently(partial(self._on, queue.take_back_tile, tile))
+
+    def gather(self, folder: PlanFolder) -> None:
+        """Bring the outputs of others into the folder of the plan, and count them for the owner of the job."""
+        for name, size in self._units.bring(folder):
+            self._room.store(name, size)
+
+    def end(self) -> None:
+        """Take all tiles out of the queue that no worker has begun."""
+        for tile in sorted(self._offered):
+            patiently(partial(self._on, queue.take_back_tile, tile))
+
+    def _on(self, act: Callable[[redis.Redis, str, int, int], bool], name: str) -> bool:
+        return act(self._connection, self._job_id, self._generation, tile_number(name))

@@ -1,0 +1,141 @@
+"""A tile of a job that another worker has: staged, trained and stored, in a process of its own (see `rq_worker`)."""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import redis
+
+from splatmill.backplane.jobs import events
+from splatmill.backplane.jobs import row as rows
+from splatmill.backplane.jobs.fold import fold
+from splatmill.backplane.jobs.row import JobRow
+from splatmill.backplane.storage.storage import Storage
+from splatmill_worker.errors import WorkerError
+from splatmill_worker.service import hand_back
+from splatmill_worker.service.disk_reserve import DiskWatch
+from splatmill_worker.service.job_folder import ENDED, TileFolder
+from splatmill_worker.service.process_exit import HANDED_BACK_STATUS, WITHDRAWN_STATUS
+from splatmill_worker.service.redis_patience import patiently
+from splatmill_worker.service.units.stored_units import StoredUnits
+from splatmill_worker.settings import storage_url
+from splatmill_worker.tiles.folder import PlanFolder, digest_of
+from splatmill_worker.tiles.units import tile_name
+
+POLL_SECONDS = 0.5
+"""Seconds between two questions whether the job still runs."""
+
+log = logging.getLogger("splatmill.attempt")
+
+
+@dataclass(frozen=True)
+class TileEntry:
+    """A tile that the queue has given to this process.
+
+    connection: the service's Redis.
+    job_id, generation: the job.
+    tile: number of the tile, from 1.
+    """
+
+    connection: redis.Redis
+    job_id: str
+    generation: int
+    tile: int
+
+
+def run_tile(entry: TileEntry) -> None:
+    """Train a tile and store it, in a process forked for it. What it does not do, the attempt that has the job does.
+
+    The process exits with WITHDRAWN_STATUS once the job has ended or is to be cancelled, wherever it is, and with
+    HANDED_BACK_STATUS when the worker stops. Raises errors of storage, Redis and the system, which the queue is to try
+    again.
+    """
+    row = patiently(lambda: _row_to_help(entry))
+    if row is None:
+        log.info("the job %s needs its tile %d no longer", entry.job_id, entry.tile)
+        return
+    watch = _JobWatch(entry)
+    disk = DiskWatch()
+
+    def stopped() -> bool:
+        return hand_back.requested() or disk.error is not None
+
+    try:
+        _train(entry, row, stopped)
+    except Exception:
+        if hand_back.requested():
+            os._exit(HANDED_BACK_STATUS)
+        if disk.error is not None:
+            error = disk.error
+        if not isinstance(error, WorkerError):
+            raise
+        log.warning("tile %d of the job %s failed here: %s", entry.tile, entry.job_id, error)
+    finally:
+        watch.close()
+        disk.close()
+
+
+def _train(entry: TileEntry, row: JobRow, stopped: Callable[[], bool]) -> None:
+    storage = Storage(storage_url())
+    units = StoredUnits(storage, entry.job_id)
+    plan, name = units.plan(), tile_name(entry.tile)
+    if plan is None:
+        log.warning("the plan of the job %s is gone, or was made by another version", entry.job_id)
+        return
+    folder = TileFolder(storage, entry.job_id, row.capture)
+    try:
+        folder.run.mkdir(parents=True, exist_ok=True)
+        folder.stage_capture()
+        if digest_of(folder.capture) != plan.digest:
+            log.warning("the photos of the job %s have changed since its plan was made", entry.job_id)
+            return
+        tiles = PlanFolder(folder.run, plan)
+        tiles.place(folder.capture)
+        tiles.release()
+        units.bring(tiles)
+        if name in tiles.states() or tiles.plan.missing(name, tiles.states()):
+            return
+        # Not imported by the worker that forks this process: numpy and the decoders start threads.
+        from splatmill_worker.images.decoding import decoders
+        from splatmill_worker.tiles.stages import Context, run_unit
+
+        with decoders.confined([folder.path], folder.run / ENDED, stopped), tiles.claimed(name) as run:
+            run_unit(Context(tiles, run, lambda event: None, stopped))
+        units.put(run.path)
+    finally:
+        folder.close()
+
+
+def _row_to_help(entry: TileEntry) -> JobRow | None:
+    """The row of the job; None when it was deleted or restarted, is to be cancelled, or has ended."""
+    row = rows.read(entry.connection, entry.job_id)
+    if row is None or row.generation != entry.generation or row.cancel_requested_at is not None:
+        return None
+    return None if fold(row, events.read_states(entry.connection, entry.job_id)).state.final else row
+
+
+class _JobWatch:
+    """Ends this process, from a thread, when the job has ended or is to be cancelled: at once, also in native code."""
+
+    def __init__(self, entry: TileEntry) -> None:
+        self._entry = entry
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="job watch", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the thread."""
+        self._stop.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._stop.wait(POLL_SECONDS):
+            try:
+                if _row_to_help(self._entry) is None:
+                    os._exit(WITHDRAWN_STATUS)
+            except redis.RedisError:
+                continue

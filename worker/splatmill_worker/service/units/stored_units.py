@@ -1,0 +1,78 @@
+"""The units of a job in storage: its plan, and a folder for each output, whose last file is stored last."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
+
+from splatmill import __version__
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Entry, Storage
+from splatmill_worker.service import staging
+from splatmill_worker.tiles.folder import DONE, PLAN, UNITS, PlanFolder
+from splatmill_worker.tiles.units import ScenePlan
+
+VERSION = "version"
+"""Field of the stored plan with the version of the program that made it: others may train differently."""
+
+
+class StoredUnits:
+    """The units of one job, as any worker reads and writes them.
+
+    storage: where they are.
+    job_id: the job.
+    """
+
+    def __init__(self, storage: Storage, job_id: str) -> None:
+        self._storage = storage
+        self._prefix = layout.job_units(job_id)
+
+    def put_plan(self, plan: ScenePlan) -> None:
+        """Store the plan."""
+        document = plan.as_dict() | {VERSION: __version__}
+        self._storage.put(f"{self._prefix}/{PLAN}", json.dumps(document).encode())
+
+    def plan(self) -> ScenePlan | None:
+        """The stored plan; None where there is none, or another version of the program made it."""
+        path = f"{self._prefix}/{PLAN}"
+        if not self._storage.exists(path):
+            return None
+        document = json.loads(self._storage.get(path))
+        if document.get(VERSION) != __version__:
+            return None
+        return ScenePlan.from_dict(document)
+
+    def put(self, output: Path, room: Callable[[str, int], None] = lambda name, size: None) -> None:
+        """Store the output of a unit, its last file last, unless it is stored.
+
+        room: called with the name and the size of each file before it is stored.
+        """
+        target, last = f"{self._prefix}/{output.name}", output / DONE
+        files = [*(path for path in sorted(output.rglob("*")) if path.is_file() and path != last), last]
+        names = [path.relative_to(output).as_posix() for path in files]
+        for path, name in zip(files, names, strict=True):
+            room(f"{output.name}/{name}", path.stat().st_size)
+        if not self._storage.exists(f"{target}/{DONE}"):
+            for path, name in zip(files, names, strict=True):
+                self._storage.put(f"{target}/{name}", path)
+
+    def bring(self, folder: PlanFolder) -> list[tuple[str, int]]:
+        """Copy the outputs that the folder of the plan lacks into it. Return the names and sizes of their files."""
+        wanted: dict[str, dict[str, Entry]] = defaultdict(dict)
+        for entry in self._storage.entries(self._prefix):
+            output, _, name = entry.path.removeprefix(f"{self._prefix}/").partition("/")
+            if name and not (folder.root / UNITS / output / DONE).is_file():
+                wanted[output][name] = entry
+        brought = []
+        for output, files in wanted.items():
+            if DONE not in files:
+                continue  # it is being stored
+            part = folder.root / UNITS / f".{output}.part"
+            shutil.rmtree(part, ignore_errors=True)
+            staging.fetch(self._storage, {part / name: entry for name, entry in files.items()})
+            part.rename(folder.root / UNITS / output)
+            brought += [(f"{output}/{name}", entry.size) for name, entry in files.items()]
+        return brought

@@ -1,0 +1,233 @@
+"""A job whose scene is trained in tiles: all units of its plan, of which other processes may do the tiles."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from splatmill.schema import (
+    CamerasEvent,
+    Event,
+    JobState,
+    LogEvent,
+    PreviewEvent,
+    ProgressEvent,
+    StateEvent,
+    TrainOptions,
+)
+from splatmill.schema.quantities import listed
+from splatmill_worker.errors import Cancelled, WorkerError
+from splatmill_worker.memory import return_freed
+from splatmill_worker.pipeline.events import Emit
+from splatmill_worker.pipeline.job import check_lpips, choose_kernels
+from splatmill_worker.pipeline.live import Looks, Onlookers
+from splatmill_worker.pipeline.stages import Outcome
+from splatmill_worker.tiles.folder import TILES, PlanFolder, digest_of, facts_of
+from splatmill_worker.tiles.retrying import may_pass
+from splatmill_worker.tiles.stages import SFM, Context, run_unit
+from splatmill_worker.tiles.units import ScenePlan
+
+CHECKPOINTS = "checkpoints"
+"""Folder of the checkpoints of the coarse training in the folder of a run."""
+
+WAIT_SECONDS = 1.0
+"""Time between two looks for the tiles that other processes do, while nothing is left for this one."""
+
+STATES = {"cameras": JobState.sfm, "coarse": JobState.training, "scene": JobState.exporting}
+"""The state that a job enters with a unit."""
+
+
+class Others(Protocol):
+    """Processes that do tiles beside the one that has the job."""
+
+    def begin(self, folder: PlanFolder) -> None:
+        """Let others find the plan, and bring what was done by earlier attempts into its folder."""
+
+    def stored(self, output: Path) -> None:
+        """Let others, and later attempts, find the output of a unit."""
+
+    def offer(self, tiles: Sequence[str]) -> None:
+        """Let others do these tiles. Those that were offered before stay as they are."""
+
+    def take_back(self, tile: str) -> bool:
+        """Take a tile that was offered; returns whether no other does it now."""
+
+    def gather(self, folder: PlanFolder) -> None:
+        """Bring the outputs of others into the folder of the plan."""
+
+    def end(self) -> None:
+        """Take back all that nobody has begun."""
+
+
+class Nobody:
+    """No other process does tiles."""
+
+    def begin(self, folder: PlanFolder) -> None:
+        """Do nothing."""
+
+    def stored(self, output: Path) -> None:
+        """Do nothing."""
+
+    def offer(self, tiles: Sequence[str]) -> None:
+        """Do nothing."""
+
+    def take_back(self, tile: str) -> bool:
+        """Nobody has it."""
+        return True
+
+    def gather(self, folder: PlanFolder) -> None:
+        """Do nothing."""
+
+    def end(self) -> None:
+        """Do nothing."""
+
+
+@dataclass(frozen=True)
+class _Work:
+    """What all units of a job are done with."""
+
+    folder: PlanFolder
+    workdir: Path
+    emit: Emit
+    cancelled: Callable[[], bool]
+    looks: Looks | None
+    others: Others
+
+
+def run(
+    capture: Path,
+    workdir: Path,
+    options: TrainOptions,
+    emit: Emit,
+    cancelled: Callable[[], bool],
+    *,
+    onlookers: Onlookers | None = None,
+    others: Others | None = None,
+) -> Outcome:
+    """Train a scene in as many tiles as `options` say, and leave in `workdir/out` what `pipeline.run` leaves.
+
+    The arguments are those of `pipeline.run`. others: processes that do tiles as well; None: there are none.
+
+    What has been done is used again by a run in the same folder. A tile that fails is replaced by the coarse model, as
+    the report says. Raises Refusal, SfmFailed and TrainingFailed (see `errors`).
+    """
+    plan = ScenePlan(digest_of(capture), options)
+    folder = PlanFolder(workdir / TILES, plan)
+    looks = None if onlookers is None else Looks(onlookers)
+    work = _Work(folder, workdir, emit, cancelled, looks, others or Nobody())
+    choose_kernels(options)
+    check_lpips(options)
+    folder.save()
+    folder.place(capture)
+    folder.release()
+    work.others.begin(folder)
+    try:
+        while "scene" not in folder.states():
+            _step(work)
+    except Cancelled:
+        return Outcome("cancelled", workdir / "out")
+    finally:
+        work.others.end()
+    scene = folder.ended()["scene"].path
+    assert scene is not None
+    shutil.rmtree(workdir / "out", ignore_errors=True)
+    shutil.copytree(scene, workdir / "out", copy_function=os.link)
+    return Outcome("succeeded", workdir / "out")
+
+
+def _step(work: _Work) -> None:
+    """Do the next unit, or wait for those of others."""
+    if work.cancelled():
+        raise Cancelled
+    folder, others = work.folder, work.others
+    ready = folder.plan.ready(folder.states())
+    tiles = [name for name in ready if name in folder.plan.tile_names]
+    if tiles:
+        others.offer(tiles)
+    free = next((name for name in ready if name not in tiles or others.take_back(name)), None)
+    others.gather(folder)  # what has ended since
+    if free is None:
+        _wait(work, tiles)
+    elif free not in folder.states():
+        _do(work, free)
+
+
+def _do(work: _Work, name: str) -> None:
+    """Do a unit. The failure of a tile is recorded; that of another unit is raised."""
+    folder = work.folder
+    if name in STATES:
+        work.emit(StateEvent(state=STATES[name]))
+    with folder.claimed(name) as run:
+        context = Context(
+            folder,
+            run,
+            _Events(work, name, run.work),
+            work.cancelled,
+            work.looks,
+            work.workdir / SFM,
+            work.workdir / CHECKPOINTS if name == "coarse" else None,
+        )
+        try:
+            run_unit(context)
+        except WorkerError as error:
+            if name not in folder.plan.tile_names or may_pass(error):
+                raise
+            run.fail(error.message, error.advice or "")
+            work.emit(LogEvent(level="warning", message=f"{name} failed: {error}"))
+            return
+    return_freed()
+    if name != "scene":
+        work.others.stored(run.path)
+    if name == "cameras":
+        # Where the service looks for cameras that other jobs on the capture can use.
+        shutil.copytree(run.path / SFM, work.workdir / SFM, copy_function=_link, dirs_exist_ok=True)
+    elif name == "coarse":
+        shutil.rmtree(work.workdir / CHECKPOINTS, ignore_errors=True)
+    elif name in folder.plan.tile_names:
+        facts = facts_of(run.path)
+        message = f"{name} is trained: {facts['gaussians']:,} Gaussians, {facts['photos']} photos."
+        work.emit(LogEvent(message=message))
+
+
+def _wait(work: _Work, tiles: Sequence[str]) -> None:
+    """Wait for tiles that other processes do."""
+    count = work.folder.plan.tiles
+    work.emit(
+        ProgressEvent(
+            stage="tiles",
+            done=count - len(tiles),
+            total=count,
+            note=f"waiting for {listed(tiles, 4)}, which other workers train",
+        )
+    )
+    time.sleep(WAIT_SECONDS)
+
+
+class _Events:
+    """Emits the events of a unit as those of the job."""
+
+    def __init__(self, work: _Work, name: str, folder: Path) -> None:
+        self._work, self._name, self._folder = work, name, folder
+        self._label = {"coarse": "coarse model", "scene": "whole scene"}.get(
+            name, f"{name.replace('-', ' ')} of {work.folder.plan.tiles}"
+        )
+
+    def __call__(self, event: Event) -> None:
+        if isinstance(event, PreviewEvent | CamerasEvent):
+            path = (self._folder / event.path).relative_to(self._work.workdir)
+            event = event.model_copy(update={"path": path.as_posix()})
+        elif isinstance(event, ProgressEvent) and self._name != "cameras":
+            note = self._label if event.note is None else f"{self._label}: {event.note}"
+            event = event.model_copy(update={"note": note})
+        self._work.emit(event)
+
+
+def _link(source: str, target: str) -> None:
+    with suppress(FileExistsError):
+        os.link(source, target)
