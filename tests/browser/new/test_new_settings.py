@@ -32,6 +32,11 @@ EXCLUDED = {
 """Values that exclude each other, by their options."""
 
 
+def titled(name: str) -> str:
+    """The title of a setting."""
+    return "Time for training alone" if name == "time_budget" else name.replace("_", " ").capitalize()
+
+
 def put(page: Page, name: str, value: str) -> None:
     field = page.locator(f"#option-{name}")
     if field.evaluate("(field) => field instanceof HTMLSelectElement"):
@@ -64,9 +69,7 @@ def test_settings_that_exclude_each_other_are_refused_where_they_are(
         expect(page.locator(f"#option-{name}-error")).to_be_empty()
         put(page, name, value)
     # Names that are no words are shown as the titles of the settings.
-    said = re.sub(
-        r"\b[a-z]+_[a-z]+\b", lambda name: f'"{name[0].replace("_", " ").capitalize()}"', conflict.reason
-    )
+    said = re.sub(r"\b[a-z]+_[a-z]+\b", lambda name: f'"{titled(name[0])}"', conflict.reason)
     for name in conflict.names:
         expect(page.locator(f"#option-{name}-error")).to_have_text(said)
         expect(page.locator(f"#option-{name}")).to_have_attribute("aria-invalid", "true")
