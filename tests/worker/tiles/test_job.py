@@ -1,5 +1,5 @@
-"""A job in tiles, unit after unit in one process: which units are done, what is said of them, and what another attempt
-does again.
+"""A job in tiles, unit after unit in one process: which units are done, what its events say of them, and what another
+attempt does again.
 
 Does not prove that others find the tiles: tests/service/test_tiles.py does.
 """

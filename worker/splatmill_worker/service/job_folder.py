@@ -139,7 +139,12 @@ class JobFolder:
         # Renamed when it is whole: a part of it would pass for what an attempt on this machine left.
         part = self.path / _RESTORING
         shutil.rmtree(part, ignore_errors=True)
-        entries = {entry.path[len(stored) + 1 :]: entry for entry in self.storage.entries(stored)}
+        units = layout.job_units(self.job_id)  # which a scene in tiles fetches itself
+        entries = {
+            entry.path[len(stored) + 1 :]: entry
+            for entry in self.storage.entries(stored)
+            if not entry.path.startswith(f"{units}/")
+        }
         fetch(self.storage, {part / name: entry for name, entry in entries.items()})
         if entries:
             part.rename(self.run)
