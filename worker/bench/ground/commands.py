@@ -45,8 +45,8 @@ def run(arguments: list[str], log: Path) -> Usage:
     memory = _Memory(child.pid)
     last, silence, tail = start, (0.0, ""), [""]
     assert child.stdout is not None
-    with memory, log.open("w") as file:
-        for line in child.stdout:
+    with memory, log.open("w") as file, child.stdout as lines:
+        for line in lines:
             now, line = time.perf_counter(), line.rstrip()
             silence = max(silence, (now - last, tail[-1]))
             last, tail = now, [*tail[-4:], line]

@@ -67,12 +67,15 @@ def capture(
                 done(number + 1)
     finally:
         torch.set_num_threads(threads)
-    write_model(_model(named), truth, text=True)
+    write_truth(named, truth)
     return named
 
 
-def _model(named: dict[str, Camera]) -> pycolmap.Reconstruction:
-    """The cameras as a COLMAP model without points."""
+def write_truth(named: dict[str, Camera], folder: Path) -> None:
+    """Write cameras of one lens, by the names of their photos, to an existing folder: COLMAP's text without points.
+
+    Raises OSError where it cannot be written whole.
+    """
     model = pycolmap.Reconstruction()
     first = next(iter(named.values()))
     params = [first.fx, first.fy, first.cx, first.cy]
@@ -83,7 +86,7 @@ def _model(named: dict[str, Camera]) -> pycolmap.Reconstruction:
     for number, (name, camera) in enumerate(named.items(), 1):
         image = pycolmap.Image(name=name, camera_id=1, image_id=number)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(camera.viewmat[:3]))
-    return model
+    write_model(model, folder, text=True)
 
 
 def _exif(camera: Camera, measured: np.ndarray) -> Image.Exif:
