@@ -197,6 +197,8 @@ def growth(rows: list[Row]) -> str:
 
 def generator(rows: list[Row]) -> str:
     """What making the photos takes."""
+    if not rows:
+        return ""
     per = [row["generate_cpu"] / row["photos"] for row in rows]
     most = max(row["generate_memory"] for row in rows)
     return (
