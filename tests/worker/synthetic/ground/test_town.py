@@ -29,7 +29,7 @@ def met(solid: Solid, eye: np.ndarray, ray: np.ndarray) -> float:
     if isinstance(solid, Ball):
         place, ray = (eye - solid.center) / solid.radii, ray / solid.radii
         a, b, c = ray @ ray, place @ ray, place @ place - 1.0
-        return (-b - math.sqrt(b * b - a * c)) / a if b * b > a * c and b < 0 else math.inf
+        return float(-b - math.sqrt(b * b - a * c)) / float(a) if b * b > a * c and b < 0 else math.inf
     near, far = -math.inf, math.inf
     for normal, limit in zip(solid.normals, solid.limits, strict=True):
         reach = (limit - normal @ eye) / (normal @ ray)
@@ -37,7 +37,7 @@ def met(solid: Solid, eye: np.ndarray, ray: np.ndarray) -> float:
             near = max(near, reach)
         else:
             far = min(far, reach)
-    return near if 0 < near < far else math.inf
+    return float(near) if 0 < near < far else math.inf
 
 
 def around(town: Town, camera: Camera) -> list[Solid]:
@@ -65,8 +65,8 @@ def test_depths_are_those_of_the_nearest_solid_or_of_the_ground(town: Town) -> N
         expected, on_ball = min([(ground, False), *hits])
         on_solids += expected < ground
         # A ball is met at the root of a small difference of squares, in single precision.
-        error = {"abs": 0.01} if on_ball else {"rel": 1e-5}
-        assert depth[row, column] == pytest.approx(expected, **error), (row, column)
+        error = 0.01 if on_ball else 1e-5 * expected
+        assert depth[row, column] == pytest.approx(expected, abs=error), (row, column)
     assert on_solids > 20
 
 

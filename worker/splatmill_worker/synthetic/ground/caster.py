@@ -177,7 +177,8 @@ class _Faces:
             np.concatenate([np.zeros((0, FACES, width), np.float32), *(s.looks[None] for s in seen)])
         )
         textures = np.concatenate([np.zeros((0, FACES), np.int64), *(s.textures[None] for s in seen)])
-        columns = dict(zip(LOOKS, table.reshape(-1, width).split(list(LOOKS.values()), 1), strict=True))
+        parts = torch.split_with_sizes(table.reshape(-1, width), list(LOOKS.values()), 1)
+        columns = dict(zip(LOOKS, parts, strict=True))
         return cls(columns, torch.from_numpy(textures.reshape(-1)))
 
     def at(self, face: Tensor, name: str) -> Tensor:
@@ -228,7 +229,8 @@ class _Samples:
             at, kind, step = (pixel // width, pixel % width), split[:, 0, :, 0].reshape(-1)[pixel], samples
         else:
             apart = ~same[:, None, :, None].expand(-1, samples, -1, samples).reshape(face.shape)
-            at = apart.nonzero(as_tuple=True)
+            row, column = apart.nonzero(as_tuple=True)
+            at = (row, column)
             mean, lit, kind, step = inverse[at], light[at].float(), face[at], 1
             x, y, pixel = rays.x, rays.y, at[0] // samples * width + at[1] // samples
         apart_ = step * float(rays.x[1] - rays.x[0])

@@ -110,7 +110,8 @@ def _attitude(heading: float, tilt: float, roll: float, yaw: float) -> Float:
         np.array([0.0, 0.0, -1.0]),
     )
     level = np.stack([right, -ahead, down])
-    return _about(0, -tilt) @ _about(1, roll) @ _about(2, yaw) @ level
+    rotation: Float = _about(0, -tilt) @ _about(1, roll) @ _about(2, yaw) @ level
+    return rotation
 
 
 def _about(axis: int, angle: float) -> Float:

@@ -126,8 +126,8 @@ def facade(random: np.random.Generator, wall: Color) -> Texture:
             )
             if random.uniform() < 0.12:
                 continue
-            left, right = column + random.integers(8, 14), column + bay - random.integers(8, 14)
-            low, high = row + random.integers(12, 18), row + bay - random.integers(8, 12)
+            left, right = column + int(random.integers(8, 14)), column + bay - int(random.integers(8, 14))
+            low, high = row + int(random.integers(12, 18)), row + bay - int(random.integers(8, 12))
             draw.rectangle(
                 [left - 2, low - 2, right + 2, high + 2], fill=_whole(_times(WHITE, random.uniform(0.7, 1)))
             )

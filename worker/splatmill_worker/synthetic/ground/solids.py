@@ -50,7 +50,7 @@ class Rays:
     def along(self, normal: Float, factor: float = 1.0) -> Tensor:
         """`factor` times the products [H, W] of all directions and `normal` [3]."""
         a, b, c = (self.rotation @ normal * factor).tolist()
-        return (a * self.x)[None, :] + (b * self.y + c)[:, None]
+        return torch.add((a * self.x)[None, :], (b * self.y + c)[:, None])
 
 
 @dataclass(frozen=True)

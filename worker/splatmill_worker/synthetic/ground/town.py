@@ -155,7 +155,8 @@ class _Builder:
             a, b = ends + side, ends - side
             self._mark([tuple(p) for p in (a[0], a[1], b[1], b[0])], (178.0, 160.0, 128.0))
         for _ in range(30):
-            self.tree(*self.random.uniform(_LOW + 2, BLOCK - _LOW - 2, 2), 1.25)
+            x, y = self.random.uniform(_LOW + 2, BLOCK - _LOW - 2, 2).tolist()
+            self.tree(x, y, 1.25)
 
     def works(self) -> None:
         """A hall with a flat roof, and a yard with marked places for cars."""
@@ -177,7 +178,8 @@ class _Builder:
             for side in (LANE + 1.2, BLOCK - LANE - 1.2):
                 for along in np.arange(10.0, BLOCK - 10.0, 9.0):
                     if self.random.uniform() < 0.4:
-                        self.tree(*((side, along) if turned else (along, side)), 0.8)
+                        x, y = (side, float(along)) if turned else (float(along), side)
+                        self.tree(x, y, 0.8)
 
     def house(self, x: float, y: float, width: float, depth: float) -> None:
         """A house with a saddle roof, whose ridge runs along its depth, and a chimney."""
