@@ -14,7 +14,7 @@ import psutil
 from _rows import worked
 
 SAMPLED = 0.5
-"""Seconds between two looks at the memory of a command's processes."""
+"""Seconds between two samples of the memory of a command's processes."""
 
 
 @dataclass(frozen=True)
