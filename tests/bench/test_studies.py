@@ -22,7 +22,10 @@ from tests.support.paths import ROOT
 
 STUDIES = [
     *((name, "STUDY") for name in ("stability", "worst", "functions", "stiffness", "precision")),
-    *((name, "STUDY") for name in ("kernels", "scale", "sfm", "formats", "mesh", "live", "gabor", "tiles")),
+    *(
+        (name, "STUDY")
+        for name in ("kernels", "scale", "sfm", "formats", "mesh", "live", "gabor", "tiles", "ground")
+    ),
     ("kernels", "SIZES"),
     ("sfm", "GROWTH"),
     *((name, "STUDY") for name in ("abuse", "capacity", "fleet", "fuzz", "load", "openapi", "rq_alone")),
@@ -31,9 +34,9 @@ STUDIES = [
 
 def study_of(module: str, name: str) -> Study:
     """A study of a benchmark's file. By its path: tests/kernels is a `kernels` too."""
-    path = next(
-        path for part in ("worker", "server") if (path := ROOT / part / "bench" / f"{module}.py").exists()
-    )
+    folders = [ROOT / part / "bench" for part in ("worker", "server")]
+    places = [folder / file for folder in folders for file in (f"{module}.py", f"{module}/{module}.py")]
+    path = next(path for path in places if path.exists())
     spec = importlib.util.spec_from_file_location(f"bench_{module}", path)
     assert spec is not None
     assert spec.loader is not None

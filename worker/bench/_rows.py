@@ -31,8 +31,8 @@ def origin(*parts: str) -> Row:
         ).stdout.strip()
 
     # Rows and what is drawn from them are the outcome, not what is measured.
-    sources = ("..", *(f"../../{part}" for part in parts), ":(exclude,glob,top)**/bench/results/**")
-    sources += (":(exclude,glob,top)**/bench/figures/**", ":(exclude,top)*.md")
+    sources = ("..", *(f"../../{part}" for part in parts), ":(exclude,glob,top)**/bench/**/results/**")
+    sources += (":(exclude,glob,top)**/bench/**/figures/**", ":(exclude,top)*.md")
     commit = git("rev-parse", "--short", "HEAD") + (
         "+" if git("status", "--porcelain", "--", *sources) else ""
     )

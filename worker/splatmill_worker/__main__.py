@@ -172,9 +172,14 @@ def return_freed_memory() -> None:
 def _bench(name: str, arguments: list[str]) -> int:
     parts = Path(__file__).resolve().parent.parent.parent
     folders = [parts / part / "bench" for part in ("worker", "server")]
-    script = next((path for folder in folders if (path := folder / f"{name}.py").is_file()), None)
+    # A file, or a folder of several with the one of its name.
+    places = (path for folder in folders for path in (folder / f"{name}.py", folder / name / f"{name}.py"))
+    script = next((path for path in places if path.is_file()), None)
     if script is None:
-        found = (path.stem for folder in folders for path in folder.glob("*.py"))
+        found = [path.stem for folder in folders for path in folder.glob("*.py")]
+        found += [
+            path.stem for folder in folders for path in folder.glob("*/*.py") if path.stem == path.parent.name
+        ]
         known = sorted(stem for stem in found if not stem.startswith("_"))
         print(
             f"There is no benchmark {name!r}. The benchmarks are {', '.join(known)}."

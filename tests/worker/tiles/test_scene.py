@@ -173,6 +173,7 @@ def test_a_failed_tile_leaves_a_scene_with_the_coarse_model_in_its_place(whole: 
     with folder.claimed("tile-1") as run:
         run.fail("Training diverged.", "Try another seed.")
     text = done("splatmill", "unit", str(root))
+    assert text.startswith("scene: begins\n"), text
     assert "tile-1     failed    Training diverged. Try another seed." in text
     report = json.loads((root / "scene" / "report.json").read_text())
     (warning,) = (each for each in report["warnings"] if "Tile 1 of 2" in each)

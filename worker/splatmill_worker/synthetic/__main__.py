@@ -1,13 +1,17 @@
-"""`python -m splatmill_worker.synthetic DIR` writes photos of the still life to a folder."""
+"""`python -m splatmill_worker.synthetic DIR` writes photos of the still life to a folder; `... ground DIR` a flight."""
 
 import argparse
+import sys
 from pathlib import Path
 
 from splatmill_worker.synthetic import capture
+from splatmill_worker.synthetic.ground import command
 
 
-def main() -> None:
-    """Write the photos and print where they are."""
+def main() -> int:
+    """Write the photos and print where they are; returns the exit status."""
+    if sys.argv[1:2] == ["ground"]:
+        return command.main(sys.argv[2:])
     parser = argparse.ArgumentParser(prog="python -m splatmill_worker.synthetic", description=__doc__)
     parser.add_argument("directory", type=Path)
     parser.add_argument("--count", type=int, default=40)
@@ -18,7 +22,8 @@ def main() -> None:
     given = parser.parse_args()
     capture(given.directory, given.count, given.width, given.height, given.seed, given.samples)
     print(f"{given.count} photos of the built-in still life are in {given.directory}")
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -65,7 +65,7 @@ class MipMap:
 def painted(rng: np.random.Generator, size: int, density: int) -> np.ndarray:
     """Discs, bars and triangles of a warm palette over noise, uint8 [size, size, 3]; `density`: their number."""
     base = _PALETTE[rng.integers(len(_PALETTE))] * 0.5 + 90
-    canvas = Image.fromarray((base + 26 * _noise(rng, size)[..., None]).clip(0, 255).astype(np.uint8))
+    canvas = Image.fromarray((base + 26 * octaves(rng, size)[..., None]).clip(0, 255).astype(np.uint8))
     draw = ImageDraw.Draw(canvas)
     for _ in range(density):
         color = tuple(
@@ -87,8 +87,8 @@ def painted(rng: np.random.Generator, size: int, density: int) -> np.ndarray:
 
 def planks(rng: np.random.Generator, size: int) -> np.ndarray:
     """Floor boards with grain, uint8 [size, size, 3]."""
-    grain = np.repeat(_noise(rng, size)[:, :: size // 64], size // 64, axis=1)
-    canvas = np.array([150.0, 110.0, 76.0]) + 16 * grain[..., None] + 9 * _noise(rng, size)[..., None]
+    grain = np.repeat(octaves(rng, size)[:, :: size // 64], size // 64, axis=1)
+    canvas = np.array([150.0, 110.0, 76.0]) + 16 * grain[..., None] + 9 * octaves(rng, size)[..., None]
     boards = 8
     for board in range(boards):
         rows = slice(board * size // boards, (board + 1) * size // boards)
@@ -104,7 +104,7 @@ def sky(rng: np.random.Generator, size: int) -> np.ndarray:
     latitude = ((np.arange(size) + 0.5) / size)[:, None]
     # Row v, from 0 to 1, holds the latitude pi * v, wrapped to -pi/2 .. pi/2: the upper half of the dome comes first.
     up = np.where(latitude < 0.5, latitude * 2, 0.0)[..., None]
-    noise = _noise(rng, size)
+    noise = octaves(rng, size)
     ridge = 0.035 + 0.02 * noise[size // 3]
     hills = (latitude < ridge[None, :]) | (latitude > 0.5)
     dome = np.empty((size, size, 3), np.uint8)
@@ -123,7 +123,7 @@ def _grain(rng: np.random.Generator, canvas: Image.Image) -> np.ndarray:
     return (soft + rng.normal(0, 7, soft.shape[:2])[..., None]).clip(0, 255).astype(np.uint8)
 
 
-def _noise(rng: np.random.Generator, size: int) -> np.ndarray:
+def octaves(rng: np.random.Generator, size: int) -> np.ndarray:
     """Periodic noise of six octaves with unit standard deviation, float64 [size, size]."""
     total = np.zeros((size, size))
     for octave in range(2, 8):

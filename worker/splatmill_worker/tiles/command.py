@@ -227,6 +227,8 @@ def _do_all(root: Path) -> int:
 
 def _in_process(root: Path, name: str, stopped: _StopSignals) -> int:
     """Do one unit in a process of its own, which gives all memory back; its exit status, negative for a signal."""
+    # Short units end before their first line of progress, and a process takes seconds to load its libraries.
+    print(f"{name}: begins", flush=True)
     child = subprocess.Popen([sys.executable, "-m", "splatmill_worker", "unit", str(root), name])
     while True:
         try:

@@ -20,6 +20,6 @@ def doctor(context: typer.Context) -> None:
 
 def bench(context: typer.Context) -> None:
     """Measure errors and times: kernels, scale, functions, stability, worst, stiffness, sfm, train, live, formats,
-    mesh, gabor; the service: soak, load, abuse, capacity, fleet, openapi, fuzz, and their summary; and rq_alone."""
+    mesh, gabor, ground; the service: soak, load, abuse, capacity, fleet, openapi, fuzz, their summary, and rq_alone."""
     require("splatmill_worker", "`splatmill bench`")
     exec_module("splatmill_worker", "bench", *context.args)
