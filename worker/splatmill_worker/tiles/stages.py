@@ -134,7 +134,8 @@ def _coarse(context: Context, stages: Stages) -> dict[str, Any]:
     engine = open_engine(
         seeded(planned.first, cameras, photos, decided), decided.kernels, clustered=decided.cluster_culling
     )
-    trained, _ = train_scene(job, cameras, photos, decided, engine)
+    # LPIPS is measured of the whole scene.
+    trained, _ = train_scene(job, cameras, photos, replace(decided, lpips=False), engine)
     if trained.failure is not None:
         raise trained.failure
     shutil.rmtree(context.run.out)
