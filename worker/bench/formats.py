@@ -2,10 +2,15 @@
 
     splatmill bench formats                          # the still life and fox, 3000 steps each: about five minutes
     splatmill bench formats --scenes fox --steps 600
+    splatmill bench formats --only levels            # the levels of detail of the same models
 
 Each scene is trained once, at 480 pixels with every 8th photo held out. Its model is written in every format, read
 back, and compared with the held-out photos, as the renderer does for downloads. Seconds are CPU seconds of one thread,
 since other programs disturb them less.
+
+The levels of a `lod-meta.json` are compared with level 0 as it is seen from near, from the cameras of the held-out
+photos. From afar, a picture is 4 and 16 times as small, and the truth in each pixel is the mean of the pixels of the
+near picture, which level 0 itself misses, since it aliases there.
 
 Expected before it was measured: .glb without loss; .spz at an eighth of the bytes for 0.2 dB; .compressed.ply at a
 fourth for 0.2 dB; .sog at a fourteenth for 0.4 dB, more where few steps leave much noise in the harmonics.
@@ -16,7 +21,8 @@ from __future__ import annotations
 import argparse
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import _page
@@ -33,26 +39,47 @@ from splatmill.schema import DOWNLOADS, Event, TrainOptions
 from splatmill_worker import pipeline
 from splatmill_worker.errors import Refusal
 from splatmill_worker.render_service import conversion
-from splatmill_worker.render_service.model_cache import ModelCache
-from splatmill_worker.splat.formats import registry
+from splatmill_worker.render_service.encoding import camera_of
+from splatmill_worker.render_service.model_cache import LoadedModel, ModelCache
+from splatmill_worker.scene import Camera
+from splatmill_worker.splat.evaluate import psnr
+from splatmill_worker.splat.formats import registry, streamed_sog
+from splatmill_worker.splat.gaussians import Gaussians, concatenate
+from splatmill_worker.splat.lod.levels import make_levels
+from splatmill_worker.splat.render import render
 
 CACHE = HERE.parent / "build" / "bench"
 MODEL = "bench000formats0"
+TIMES = (1, 4, 16)
+"""How many times as small the pictures of levels are."""
 
 
 def measured(options: argparse.Namespace) -> Iterator[Row | str]:
-    """The rows of the scenes that were asked for."""
+    """The rows of the formats of the scenes that were asked for."""
+    yield from _of_scenes(options, _formats)
+
+
+def levels(options: argparse.Namespace) -> Iterator[Row | str]:
+    """The rows of the levels of detail of the scenes that were asked for."""
+    yield from _of_scenes(options, _levels)
+
+
+def _of_scenes(
+    options: argparse.Namespace, rows: Callable[[Storage, Path], Iterator[Row]]
+) -> Iterator[Row | str]:
     for name in options.scenes:
         try:
             scene = scenes.named(name, options.work)
         except (ValueError, FileNotFoundError) as error:
             yield str(error)
             continue
-        yield from measure(scene, options.steps, options.work)
+        yield from measure(scene, options.steps, options.work, rows)
 
 
-def measure(scene: scenes.Scene, steps: int, work: Path) -> Iterator[Row]:
-    """Train a scene and yield a row for each format, or one that says why there are none."""
+def measure(
+    scene: scenes.Scene, steps: int, work: Path, rows: Callable[[Storage, Path], Iterator[Row]]
+) -> Iterator[Row]:
+    """Train a scene and yield the rows of its model, or one that says why there are none."""
     row: Row = {"bench": "formats", "scene": scene.name, "asked_steps": steps}
     ready = prepared(scene, work)
     if "failure" in ready:
@@ -69,8 +96,58 @@ def measure(scene: scenes.Scene, steps: int, work: Path) -> Iterator[Row]:
             return
         storage = _stored(outcome.out, workdir / "storage")
         torch.set_num_threads(1)
-        for key in DOWNLOADS:
-            yield rounded(row | {"outcome": "written"} | _written(storage, key, workdir))
+        for found in rows(storage, workdir):
+            yield rounded(row | {"outcome": "written"} | found)
+
+
+def _formats(storage: Storage, folder: Path) -> Iterator[Row]:
+    """A row for each format."""
+    for key in DOWNLOADS:
+        yield _written(storage, key, folder)
+
+
+def _levels(storage: Storage, folder: Path) -> Iterator[Row]:
+    """A row for each level of detail, down to a sixty-fourth of the Gaussians."""
+    model = ModelCache(storage, 0).get(MODEL)
+    began = time.process_time()
+    made = make_levels(model.gaussians, coarsest=max(1, model.gaussians.count // 60))
+    seconds = time.process_time() - began
+    index = folder / "levels/lod-meta.json"
+    streamed_sog.write_levels(index, made, antialiased=model.antialias)
+    cameras = [camera_of(view.camera) for view in conversion.pictures_of(storage, MODEL)[0]]
+    for number, level in enumerate(made.levels):
+        whole = (
+            level.gaussians if made.surroundings is None else concatenate(level.gaussians, made.surroundings)
+        )
+        yield {
+            "format": index.name,
+            "level": number,
+            "gaussians": level.gaussians.count,
+            "surroundings": 0 if made.surroundings is None else made.surroundings.count,
+            "bytes": sum(path.stat().st_size for path in index.parent.glob(f"{number}_*/*")),
+            "error": sum(level.errors) / len(level.errors),
+            "seconds": seconds,
+            "pictures": len(cameras),
+            "psnr_at": {str(times): _from_afar(model, whole, cameras, times) for times in TIMES},
+        }
+
+
+def _from_afar(model: LoadedModel, gaussians: Gaussians, cameras: list[Camera], times: int) -> float:
+    """Mean PSNR, dB, of pictures that are `times` as small, against means over pixels of those of the model."""
+    found = []
+    for camera in cameras:
+        width, height = camera.width // times, camera.height // times
+        small = replace(
+            camera, width=width, height=height, fx=camera.fx / times, fy=camera.fy / times,
+            cx=camera.cx / times, cy=camera.cy / times,
+        )  # fmt: skip
+        with torch.no_grad():
+            near = render(model.gaussians, camera, antialias=model.antialias).color.clamp(0, 1)
+            shown = render(gaussians, small, antialias=model.antialias).color.clamp(0, 1)
+        near = near[: height * times, : width * times]
+        truth = near.reshape(height, times, width, times, 3).mean((1, 3))
+        found.append(psnr(float((shown - truth).double().square().mean())))
+    return sum(found) / len(found)
 
 
 def _written(storage: Storage, key: str, folder: Path) -> Row:
@@ -117,6 +194,7 @@ def _quiet(_: Event) -> None:
 
 def table(rows: list[Row]) -> str:
     """The table of each scene and format."""
+    rows = [row for row in rows if "level" not in row]
     written = {(row["scene"], row.get("format")): row for row in rows}
 
     def cell(row: Row) -> list[object]:
@@ -134,6 +212,24 @@ def table(rows: list[Row]) -> str:
     return _page.table(head, map(cell, rows))
 
 
+def table_of_levels(rows: list[Row]) -> str:
+    """The table of each scene and level."""
+    rows = [row for row in rows if "level" in row]
+
+    def cell(row: Row) -> list[object]:
+        return [
+            f"{row['scene']}, {row['surroundings']:,} around it", row["level"], f"{row['gaussians']:,}",
+            f"{row['bytes']:,}", f"{row['error']:.4f}", *(_db(row["psnr_at"][str(times)]) for times in TIMES),
+        ]  # fmt: skip
+
+    afar = "|".join(f"1/{times} of the size" for times in TIMES[1:])
+    return _page.table(f"scene|level|Gaussians|bytes|error, units|from near|{afar}", map(cell, rows))
+
+
+def _db(value: float) -> str:
+    return "-" if value >= 99 else f"{value:.2f} dB"
+
+
 def made(rows: list[Row]) -> str:
     steps = ", ".join(map(str, distinct(rows, "asked_steps")))
     text = f"Made by `splatmill bench formats` after {steps} steps at 480 pixels; CPU seconds of one thread."
@@ -143,9 +239,9 @@ def made(rows: list[Row]) -> str:
 STUDY = Study(
     name="formats",
     about=__doc__,
-    cases={"formats": measured},
-    key=("scene", "format"),
-    blocks={"formats": table, "footer": made},
+    cases={"formats": measured, "levels": levels},
+    key=("scene", "format", "level"),
+    blocks={"formats": table, "levels": table_of_levels, "footer": made},
     figures={},
     options={
         "scenes": {"nargs": "+", "default": ["synthetic", "fox"]},

@@ -81,7 +81,7 @@ def test_the_top_is_at_the_top_in_every_format(tmp_path: Path, suffix: str) -> N
         torch.full((count,), 5.0),
         ((colors - 0.5) / SH_C0)[:, None],
     )
-    path = tmp_path / f"m{suffix}"
+    path = tmp_path / (f"m{suffix}" if suffix.startswith(".") else suffix)
     registry.write(path, scene)
     model = load(path)
     camera = camera_of(overview(model, 64, orbit.UP))

@@ -90,7 +90,7 @@ def convert(model: Path, outs: Sequence[Path], photos: Path | None) -> tuple[int
 
 def table(model: Path, gaussians: int, converted: Sequence[Converted]) -> str:
     """The files with their bytes, and the PSNR of their views against photos and against those of the first file."""
-    size = model.stat().st_size
+    size = registry.size(model)
     losses = [file.loss for file in converted if file.loss is not None]
     rows = [
         ("file", "bytes", "smaller", "Gaussians", "photos", "views"),
@@ -104,7 +104,7 @@ def table(model: Path, gaussians: int, converted: Sequence[Converted]) -> str:
         ),
     ]
     for file in converted:
-        written, lost = file.path.stat().st_size, file.loss
+        written, lost = registry.size(file.path), file.loss
         after, views = (lost.photos_after, lost.views) if lost is not None else (None, None)
         ratio = f"{size / max(1, written):.1f}x"
         rows.append((str(file.path), f"{written:,}", ratio, f"{file.gaussians:,}", _db(after), _db(views)))

@@ -7,13 +7,14 @@ from dataclasses import dataclass
 class ModelFormat:
     """A file format of models.
 
-    suffix: in lower case, with its dot.
+    suffix: in lower case, with its dot; a name without one where files are called just so.
     name: what the format is called.
     media_type: with which it is served.
     readable: whether a model can be read from it.
     writable: whether a model can be written to it.
     loses: what a model loses in it, as a sentence.
     readers: programs that read it, of others.
+    folder: whether a model in it is a folder of many files, of which this one names the others.
     """
 
     suffix: str
@@ -23,6 +24,7 @@ class ModelFormat:
     writable: bool
     loses: str
     readers: tuple[str, ...] = ()
+    folder: bool = False
 
     @property
     def key(self) -> str:
@@ -98,6 +100,16 @@ MODEL_FORMATS: dict[str, ModelFormat] = {
             loses="What .sog loses.",
         ),
         ModelFormat(
+            "lod-meta.json",
+            "Streamed SOG, version 1: levels of detail in folders beside the lod-meta.json",
+            "application/json",
+            readable=True,
+            writable=True,
+            loses="What .sog loses, in the finest level.",
+            readers=("SuperSplat", "PlayCanvas", "Babylon.js", "splat-transform"),
+            folder=True,
+        ),
+        ModelFormat(
             ".glb",
             "binary glTF with KHR_gaussian_splatting",
             "model/gltf-binary",
@@ -145,11 +157,20 @@ def start_suffixes() -> str:
 
 
 def format_of(name: str) -> ModelFormat | None:
-    """The format of a file by its name: that of the longest suffix that fits, or None."""
+    """The format of a file by its name: that of the longest suffix that fits, or None.
+
+    A format without a dot before it is that of files with just this name.
+    """
     lower = name.lower()
-    matches = [form for suffix, form in MODEL_FORMATS.items() if lower.endswith(suffix)]
+    matches = [
+        form
+        for suffix, form in MODEL_FORMATS.items()
+        if (lower.endswith(suffix) if suffix.startswith(".") else lower == suffix)
+    ]
     return max(matches, key=lambda form: len(form.suffix), default=None)
 
 
-DOWNLOADS: dict[str, ModelFormat] = {form.key: form for form in MODEL_FORMATS.values() if form.writable}
-"""The formats in which a model can be downloaded, by their keys."""
+DOWNLOADS: dict[str, ModelFormat] = {
+    form.key: form for form in MODEL_FORMATS.values() if form.writable and not form.folder
+}
+"""The formats in which a model can be downloaded, by their keys: those of one file."""

@@ -46,7 +46,7 @@ def with_comments(path: Path, *comments: str) -> Path:
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("suffix", WRITTEN)
 def test_every_format_that_is_written_says_it(tmp_path: Path, suffix: str, antialiased: bool) -> None:
-    path = tmp_path / f"m{suffix}"
+    path = tmp_path / (f"m{suffix}" if suffix.startswith(".") else suffix)
     registry.write(path, some_gaussians(20, 1), antialiased=antialiased)
     assert registry.read(path).antialiased is antialiased
     assert given_file.read(path, 10)["antialiased"] is antialiased
@@ -113,7 +113,7 @@ def test_a_file_alone_is_drawn_converted_and_cleaned_as_it_says(tmp_path: Path) 
     assert float((right - wrong).abs().max()) > 0.1
     picture = torch.from_numpy(render_frame(load(model), camera_of(camera), "black")) / 255
     assert float((picture - right.clamp(0, 1)).abs().max()) < 0.01
-    outs = [tmp_path / f"out{suffix}" for suffix in WRITTEN]
+    outs = [tmp_path / (f"out{suffix}" if suffix.startswith(".") else suffix) for suffix in WRITTEN]
     convert(model, outs, None)
     clean_file(model, tmp_path / "cleaned.ply", Wanted(edit=BOX))
     assert all(load(out).antialias for out in [*outs, tmp_path / "cleaned.ply"])

@@ -29,6 +29,10 @@ def test_the_longest_suffix_counts_in_any_case() -> None:
     assert found is not None
     assert found.suffix == ".compressed.ply"
     assert format_of("scene.obj") is None
+    streamed = format_of("lod-meta.json")
+    assert streamed is not None
+    assert streamed.folder
+    assert format_of("my-lod-meta.json") is None
 
 
 def test_a_compressed_ply_is_read_under_either_suffix(tmp_path: Path) -> None:
@@ -43,7 +47,7 @@ def test_a_compressed_ply_is_read_under_either_suffix(tmp_path: Path) -> None:
 def test_every_format_that_is_written_holds_all_visible_gaussians(tmp_path: Path, suffix: str) -> None:
     scene = some_gaussians(300, 2)
     scene.logit_opacities[:10] = -20.0
-    path = tmp_path / f"scene{suffix}"
+    path = tmp_path / (f"scene{suffix}" if suffix.startswith(".") else suffix)
     assert registry.write(path, scene, antialiased=True) == 290
     if registry.CODECS[suffix].read is not None:
         assert registry.read(path).gaussians.count == 290

@@ -9,7 +9,17 @@ from typing import Protocol
 
 from splatmill.schema.files.formats import MODEL_FORMATS, format_of
 from splatmill_worker.errors import ModelUnreadable
-from splatmill_worker.splat.formats import compressed_ply, glb, gltf, ksplat, ply, sog, splat, spz
+from splatmill_worker.splat.formats import (
+    compressed_ply,
+    glb,
+    gltf,
+    ksplat,
+    ply,
+    sog,
+    splat,
+    spz,
+    streamed_sog,
+)
 from splatmill_worker.splat.formats.contents import NO_OFFSET, Contents, Offset
 from splatmill_worker.splat.gaussians import Gaussians
 
@@ -50,6 +60,7 @@ CODECS: dict[str, Codec] = {
     ".ksplat": Codec(ksplat.read, None),
     ".sog": Codec(sog.read, sog.write),
     "meta.json": Codec(sog.read, None),
+    "lod-meta.json": Codec(streamed_sog.read, streamed_sog.write),
     ".glb": Codec(glb.read, glb.write),
 }
 """One for each of `MODEL_FORMATS`; a test compares them."""
@@ -85,6 +96,13 @@ def read(path: Path) -> Contents:
     if path.exists() and not path.is_file():  # a pipe would keep its reader waiting
         raise ModelUnreadable(f"{path.name} is not a regular file.")
     return function(path)
+
+
+def size(path: Path) -> int:
+    """The bytes of a model that was written to `path`, those of the files beside it included."""
+    found = format_of(path.name)
+    parts = streamed_sog.files(path) if found is not None and found.folder else [path]
+    return sum(part.stat().st_size for part in parts)
 
 
 def write(

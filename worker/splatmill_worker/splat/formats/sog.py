@@ -10,7 +10,7 @@ import io
 import json
 import math
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -93,16 +93,33 @@ def write(
     of Gaussians. The file is replaced atomically and synced.
     """
     gaussians = visible(gaussians)
+    gaussians = gaussians.select(morton_order(_logged(gaussians.means.double())))
+    with (
+        replacing(path, sync=True) as part,
+        zipfile.ZipFile(part, "w", zipfile.ZIP_STORED) as archive,
+    ):
+        for name, content in encoded(gaussians, offset=offset, antialiased=antialiased, centroids=centroids):
+            archive.writestr(_member(name), content)
+    return gaussians.count
+
+
+def encoded(
+    gaussians: Gaussians,
+    *,
+    offset: Offset = NO_OFFSET,
+    antialiased: bool = False,
+    centroids: int | None = None,
+) -> Iterator[tuple[str, bytes]]:
+    """The files of a model by name, `meta.json` first; the Gaussians keep their order.
+
+    gaussians: such as `visible` returns. offset, antialiased, centroids: as in `write`.
+    """
     count = gaussians.count
     shown = importance(gaussians)
-    logged = gaussians.means.double()
-    logged = logged.sign() * logged.abs().log1p()
+    logged = _logged(gaussians.means.double())
     low = logged.amin(0) if count else logged.new_zeros(3)
     high = logged.amax(0) if count else logged.new_zeros(3)
     codes = ((logged - low) / (high - low).clamp(min=1e-300) * 65535).round().clamp(0, 65535).long()
-    order = morton_order(logged)
-    gaussians, codes, shown = gaussians.select(order), codes[order], shown[order]
-
     scales = palette.scalar_codebook(gaussians.log_scales, shown[:, None].expand(-1, 3))
     colors = palette.scalar_codebook(gaussians.sh[:, 0], shown[:, None].expand(-1, 3))
     opacity = (torch.sigmoid(gaussians.logit_opacities) * 255).round().clamp(1, 255)
@@ -143,14 +160,9 @@ def write(
             "codebook": book.tolist(),
             "files": ["shN_centroids.webp", "shN_labels.webp"],
         }
-    with (
-        replacing(path, sync=True) as part,
-        zipfile.ZipFile(part, "w", zipfile.ZIP_STORED) as archive,
-    ):
-        archive.writestr(_member("meta.json"), json.dumps(meta))
-        for name, plane in images.items():
-            archive.writestr(_member(name), _encoded(plane))
-    return count
+    yield "meta.json", json.dumps(meta).encode()
+    for name, plane in images.items():
+        yield name, _webp(plane)
 
 
 def read(path: Path) -> Contents:
@@ -242,7 +254,12 @@ def _centroid_plane(entries: Tensor) -> Plane:
     return plane.reshape(height, CENTROIDS_PER_ROW * coefficients, 3)
 
 
-def _encoded(plane: Plane) -> bytes:
+def _logged(means: Tensor) -> Tensor:
+    """Positions as they are stored: the logarithm of one more than their size, with their sign."""
+    return means.sign() * means.abs().log1p()
+
+
+def _webp(plane: Plane) -> bytes:
     stream = io.BytesIO()
     # exact: by default the colour under an alpha of 0 is not kept. The quality is an effort here: the highest took
     # thirty times as long for as many bytes (decisions: sog).
