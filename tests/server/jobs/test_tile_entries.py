@@ -57,6 +57,8 @@ def test_a_tile_is_taken_or_taken_back_and_never_both(connection: redis.Redis) -
     assert not queue.take_back_tile(connection, JOB, 1, 1)
     assert queue.take_back_tile(connection, JOB, 1, 2)
     assert lines.take(connection, "tester", LINES) is None
+    assert queue.offer_tile(connection, JOB, 1, 2)  # by the next attempt
+    assert take(connection).entry == entries.unit_id(JOB, 1, 2)
 
 
 @pytest.mark.usefixtures("row")
@@ -90,3 +92,12 @@ def test_waiting_tiles_of_a_generation_are_withdrawn(connection: redis.Redis) ->
     queue.withdraw_tiles(connection, JOB, 2, None)
     waiting = [entries.unit_id(JOB, generation, tile) for generation in (1, 2) for tile in (1, 2, 3)]
     assert list(lines.look(connection, waiting).places) == waiting[3:]
+
+
+def test_tiles_of_a_job_that_asks_for_a_gpu_are_for_every_worker(connection: redis.Redis) -> None:
+    write_row(connection, JOB, options=TrainOptions(tiles=3, backend=Backend.gpu))
+    queue.enqueue(connection, JOB, 1)
+    queue.offer_tile(connection, JOB, 1, 1)
+    tile, whole = entries.unit_id(JOB, 1, 1), entries.rq_id(JOB, 1)
+    places = lines.look(connection, [tile, whole]).places
+    assert (places[tile].line, places[whole].line) == ("any", "gpu")

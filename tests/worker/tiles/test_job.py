@@ -146,4 +146,25 @@ def test_a_coarse_training_that_was_interrupted_continues(tmp_path: Path) -> Non
     outcome, events = run(tmp_path, Play())
     assert outcome.ended == "succeeded"
     assert max(before) < min(measured(events))
-    assert not (tmp_path / "run" / "checkpoints").exists()
+    assert sorted(path.name for path in (tmp_path / "run").iterdir()) == ["out", "sfm", "tiles"]
+
+
+def test_a_checkpoint_of_another_plan_is_not_continued(tmp_path: Path) -> None:
+    def measured(events: list[Event]) -> list[int]:
+        return [event.step for event in events if isinstance(event, MetricEvent)]
+
+    outcome, events = run(tmp_path, Play(), lambda events: len(measured(events)) >= 3)
+    (tmp_path / "run" / "plan.json").unlink()
+    outcome, again = run(tmp_path, Play())
+    assert outcome.ended == "succeeded"
+    assert min(measured(again)) == min(measured(events))
+
+
+def test_a_job_whose_coarse_model_is_there_is_in_training(tmp_path: Path) -> None:
+    def states(events: list[Event]) -> list[JobState]:
+        return [event.state for event in events if isinstance(event, StateEvent)]
+
+    others = Play()
+    run(tmp_path, others, lambda events: "coarse" in others.stores)
+    outcome, events = run(tmp_path, Play())
+    assert (outcome.ended, states(events)) == ("succeeded", [JobState.training, JobState.exporting])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -127,6 +126,7 @@ def _make_plan(job: Job, facts: Facts, revise: Revise) -> Plan:
             "option_out_of_range", str(error), advice="Change the option and start again."
         ) from error
     # A checkpoint of another plan cannot be resumed.
-    shutil.rmtree(job.checkpoints, ignore_errors=True)
+    for checkpoint in job.checkpoints.iterdir() if job.checkpoints.is_dir() else ():
+        checkpoint.unlink()
     write_plan(stored, job.options, plan)
     return plan

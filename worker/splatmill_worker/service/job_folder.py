@@ -25,7 +25,7 @@ from splatmill_worker.service.disk_reserve import shortage
 from splatmill_worker.service.own_copy import link_or_copy
 from splatmill_worker.service.staging import Report, fetch, is_whole, stage
 from splatmill_worker.settings import work_folder
-from splatmill_worker.tiles.folder import TILES
+from splatmill_worker.tiles.folder import LEFT_BY_KILLED, TILES, UNITS
 
 LOCK_SECONDS = 10.0
 """Seconds to wait for the folder's lock, which a process that is being killed still holds for a moment."""
@@ -160,10 +160,15 @@ class JobFolder:
         shutil.rmtree(self.path, ignore_errors=True)
 
     def reset(self) -> None:
-        """Delete what the failed attempt stored, except the recovered cameras, so that a restarted job trains anew."""
-        self._delete_stored()
+        """Delete what the failed attempt stored, so that a restarted job trains anew. Recovered cameras stay, and so do
+        the units of a scene in tiles that are done.
+        """
+        units = layout.job_units(self.job_id)
+        for entry in self.storage.entries(layout.job_work(self.job_id)) if self.storage.root is None else ():
+            if not entry.path.startswith(f"{units}/"):
+                self.storage.delete(entry.path)
         for path in self.run.iterdir() if self.run.is_dir() else ():
-            if path.name != _CAMERAS:
+            if path.name not in (_CAMERAS, TILES):
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
 
     def _delete_stored(self) -> None:
@@ -199,6 +204,7 @@ def tile_folders(job_id: str) -> list[Path]:
 def remove_remade(folder: Path) -> bool:
     """Delete what an attempt would make anew; return whether there was any. The caller holds the folder's lock."""
     found = [path for name in _REMADE if (path := folder / name).exists()]
+    found += [path for name in LEFT_BY_KILLED for path in (folder / "run" / TILES / UNITS).glob(name)]
     for path in found:
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)

@@ -566,11 +566,11 @@ class AttemptWorker(Worker):
             return "superseded"
         if job.get_status() is not JobStatus.STARTED:
             return "reported"
-        if process_exit.handed_back or self._stop_requested:
-            recovery.hand_back(self, self._lease)
-            return "handed_back"
         if process_exit.withdrawn or self._exceeded is not None:
             job.retries_left = 0
+        elif process_exit.handed_back or self._stop_requested:
+            recovery.hand_back(self, self._lease)
+            return "handed_back"
         self.handle_job_failure(job, queue, exc_string=f"The process {process_exit.cause}.")
         return "stopped" if process_exit.withdrawn else "crashed" if self._exceeded is None else "limited"
 

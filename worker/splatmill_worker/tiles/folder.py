@@ -22,6 +22,9 @@ from splatmill_worker.tiles.units import ScenePlan, State
 PLAN, CAPTURES, UNITS, SCENE = "plan.json", "captures", "units", "scene"
 """The plan, captures by their digests, the outputs of the units, and a link to the output of the last one."""
 
+LEFT_BY_KILLED = ("*.work", "*.claim", ".*.part")
+"""What a process that was killed leaves among the outputs of the units."""
+
 TILES = "tiles"
 """Folder of the plan in the folder of a run that trains its scene in tiles."""
 
@@ -98,15 +101,16 @@ class PlanFolder:
     def place(self, capture: Path) -> None:
         """Let the folder of the photos be a link to `capture`."""
         self.capture.parent.mkdir(parents=True, exist_ok=True)
-        if not self.capture.is_symlink():
-            self.capture.symlink_to(capture.resolve(), target_is_directory=True)
+        if self.capture.is_symlink():
+            self.capture.unlink()  # it may lead to where the folder lay before
+        self.capture.symlink_to(capture.resolve(), target_is_directory=True)
 
     def release(self) -> None:
         """Remove what earlier processes left that ended in the middle of a unit. The caller knows that none runs."""
-        for path in (self.root / UNITS).glob("*"):
-            if path.suffix == ".work":
+        for path in [path for name in LEFT_BY_KILLED for path in (self.root / UNITS).glob(name)]:
+            if path.is_dir():
                 shutil.rmtree(path, ignore_errors=True)
-            elif path.suffix == ".claim":
+            else:
                 path.unlink(missing_ok=True)
 
     def output(self, name: str) -> Path:

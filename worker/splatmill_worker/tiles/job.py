@@ -7,7 +7,7 @@ import shutil
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
@@ -22,7 +22,7 @@ from splatmill.schema import (
     TrainOptions,
 )
 from splatmill.schema.quantities import listed
-from splatmill_worker.errors import Cancelled, WorkerError
+from splatmill_worker.errors import Cancelled, TrainingFailed, WorkerError
 from splatmill_worker.memory import return_freed
 from splatmill_worker.pipeline.events import Emit
 from splatmill_worker.pipeline.job import check_lpips, choose_kernels
@@ -30,17 +30,14 @@ from splatmill_worker.pipeline.live import Looks, Onlookers
 from splatmill_worker.pipeline.stages import Outcome
 from splatmill_worker.tiles.folder import TILES, PlanFolder, digest_of, facts_of
 from splatmill_worker.tiles.retrying import may_pass
-from splatmill_worker.tiles.stages import SFM, Context, run_unit
+from splatmill_worker.tiles.stages import CHECKPOINTS, PLAN_FILE, SFM, Context, run_unit
 from splatmill_worker.tiles.units import ScenePlan
-
-CHECKPOINTS = "checkpoints"
-"""Folder of the checkpoints of the coarse training in the folder of a run."""
 
 WAIT_SECONDS = 1.0
 """Time between two looks for the tiles that other processes do, while nothing is left for this one."""
 
-STATES = {"cameras": JobState.sfm, "coarse": JobState.training, "scene": JobState.exporting}
-"""The state that a job enters with a unit."""
+STATES = {"cameras": JobState.sfm, "scene": JobState.exporting}
+"""The state that a job enters with a unit; with every other unit, it is `training`."""
 
 
 class Others(Protocol):
@@ -98,6 +95,7 @@ class _Work:
     cancelled: Callable[[], bool]
     looks: Looks | None
     others: Others
+    entered: list[JobState] = field(default_factory=list)
 
 
 def run(
@@ -126,6 +124,7 @@ def run(
     folder.save()
     folder.place(capture)
     folder.release()
+    folder.forget_failures(*plan.tile_names)
     work.others.begin(folder)
     try:
         while "scene" not in folder.states():
@@ -161,8 +160,10 @@ def _step(work: _Work) -> None:
 def _do(work: _Work, name: str) -> None:
     """Do a unit. The failure of a tile is recorded; that of another unit is raised."""
     folder = work.folder
-    if name in STATES:
-        work.emit(StateEvent(state=STATES[name]))
+    state = STATES.get(name, JobState.training)
+    if state not in work.entered:
+        work.entered.append(state)
+        work.emit(StateEvent(state=state))
     with folder.claimed(name) as run:
         context = Context(
             folder,
@@ -171,12 +172,15 @@ def _do(work: _Work, name: str) -> None:
             work.cancelled,
             work.looks,
             work.workdir / SFM,
-            work.workdir / CHECKPOINTS if name == "coarse" else None,
+            work.workdir if name == "coarse" else None,
         )
         try:
             run_unit(context)
         except WorkerError as error:
-            if name not in folder.plan.tile_names or may_pass(error):
+            lacked_memory = isinstance(
+                error, TrainingFailed
+            )  # and would again, on the worker that has the job
+            if name not in folder.plan.tile_names or (may_pass(error) and not lacked_memory):
                 raise
             run.fail(error.message, error.advice or "")
             work.emit(LogEvent(level="warning", message=f"{name} failed: {error}"))
@@ -189,6 +193,7 @@ def _do(work: _Work, name: str) -> None:
         shutil.copytree(run.path / SFM, work.workdir / SFM, copy_function=_link, dirs_exist_ok=True)
     elif name == "coarse":
         shutil.rmtree(work.workdir / CHECKPOINTS, ignore_errors=True)
+        work.workdir.joinpath(PLAN_FILE).unlink(missing_ok=True)
     elif name in folder.plan.tile_names:
         facts = facts_of(run.path)
         message = f"{name} is trained: {facts['gaussians']:,} Gaussians, {facts['photos']} photos."

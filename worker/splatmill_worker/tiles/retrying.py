@@ -9,4 +9,6 @@ def may_pass(error: WorkerError) -> bool:
     """Whether another machine, or this one at another time, may do a unit that ended with this error."""
     if isinstance(error, TrainingFailed):
         return error.name is FailureName.memory
-    return error.code == "backend_unavailable" or not isinstance(error, Refusal | SfmFailed)
+    return error.code in ("backend_unavailable", "decoder_ended") or not isinstance(
+        error, Refusal | SfmFailed
+    )

@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from splatmill.files import replacing
 from splatmill.schema import Backend, PlanEvent, Switch, TrainOptions
 from splatmill_worker.images.load import training_size
 from splatmill_worker.pipeline.cameras import Cameras, recover_cameras
@@ -33,6 +34,9 @@ from splatmill_worker.tiles.units import ScenePlan, tile_name, tile_number
 STEPS_SHARE = 0.5
 """Share of the steps of a whole run that the coarse model takes, and that each tile takes after it."""
 
+CHECKPOINTS, PLAN_FILE = "checkpoints", "plan.json"
+"""The folder of the checkpoints and the file of the plan of a training, in its work folder."""
+
 SFM = "sfm"
 """Folder of the recovered cameras in a work folder, and in the output of the unit `cameras`."""
 
@@ -47,8 +51,8 @@ class Context:
     cancelled: polled; the unit ends with Cancelled when it returns true.
     looks: those of onlookers, who see cameras and the coarse model; None where there are none.
     known: folder of cameras that were recovered before, from which the unit `cameras` begins; None without.
-    checkpoints: folder for the checkpoints of the unit, from which another run of it continues; None: they go with the
-        run.
+    kept: folder for the plan and the checkpoints of the unit, from which another run of it continues; None: they go
+        with the run.
     """
 
     folder: PlanFolder
@@ -57,7 +61,7 @@ class Context:
     cancelled: Callable[[], bool]
     looks: Looks | None = None
     known: Path | None = None
-    checkpoints: Path | None = None
+    kept: Path | None = None
 
     def job(self, options: TrainOptions) -> Job:
         """A job in the work folder of the unit, which has the recovered cameras there are.
@@ -71,9 +75,12 @@ class Context:
         known = self.known if cameras is None or cameras.path is None else cameras.path / SFM
         if known is not None and known.is_dir():
             shutil.copytree(known, work / SFM, dirs_exist_ok=True)
-        if self.checkpoints is not None:
-            self.checkpoints.mkdir(exist_ok=True)
-            work.joinpath(self.checkpoints.name).symlink_to(self.checkpoints, target_is_directory=True)
+        if self.kept is not None:
+            checkpoints, plan = self.kept / CHECKPOINTS, self.kept / PLAN_FILE
+            checkpoints.mkdir(exist_ok=True)
+            work.joinpath(CHECKPOINTS).symlink_to(checkpoints, target_is_directory=True)
+            if plan.is_file():
+                shutil.copyfile(plan, work / PLAN_FILE)
         kernels: Kernels = "reference" if options.backend is Backend.reference else "cpu"
         if self.run.name == "coarse":
             kernels = choose_kernels(options)
@@ -128,6 +135,9 @@ def _coarse(context: Context, stages: Stages) -> dict[str, Any]:
     most = _most(cameras, job)
     job = replace(job, options=_coarse_options(plan, most))
     planned = plan_training(job, cameras, _shorter, stages)
+    if context.kept is not None:
+        with replacing(context.kept / PLAN_FILE) as part:
+            shutil.copyfile(job.workdir / PLAN_FILE, part)
     decided = planned.plan
     context.emit(PlanEvent(plan=decided.as_dict()))
     photos = planned_photos(cameras, planned, stages)

@@ -50,6 +50,8 @@ local function queue_up(entry, job, in_front)
   leave(entry)
   local row = redis.call('HMGET', '${job}' .. job, 'owner', 'priority', 'options')
   local owner, line = row[1] or '${owner}', wanted_line(row[3])
+  -- The coarse model alone is trained on a GPU.
+  if line == 'gpu' and string.match(entry, '_%d+$$') then line = 'any' end
   local number
   if in_front then
     number = redis.call('HINCRBY', counters, 'front', -1)

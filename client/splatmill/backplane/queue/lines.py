@@ -133,9 +133,12 @@ def sort(connection: redis.Redis) -> None:
     _run(connection, scripts.SORT)
 
 
-def withdraw(connection: redis.Redis, entry: str) -> bool:
-    """Remove a waiting entry, as cancelled. Return False if it does not wait: a worker may just have taken it."""
-    return bool(_run(connection, scripts.WITHDRAW, entry, KEEP_FINISHED)[1])
+def withdraw(connection: redis.Redis, entry: str, keep: int = KEEP_FINISHED) -> bool:
+    """Remove a waiting entry, as cancelled. Return False if it does not wait: a worker may just have taken it.
+
+    keep: seconds for which RQ's record of it is kept; 0: not at all, so that it can be enqueued again.
+    """
+    return bool(_run(connection, scripts.WITHDRAW, entry, keep)[1])
 
 
 def hand_back(connection: redis.Redis, lease: Lease) -> bool:

@@ -98,7 +98,7 @@ def offer_tile(connection: redis.Redis, job_id: str, generation: int, tile: int)
 def take_back_tile(connection: redis.Redis, job_id: str, generation: int, tile: int) -> bool:
     """Take a tile out of the queue. Return False if a worker has it; then that has ended, or its lease will expire."""
     entry = unit_id(job_id, generation, tile)
-    if lines.withdraw(connection, entry):
+    if lines.withdraw(connection, entry, keep=0):
         return True
     record = _record(connection, entry)
     if record is None or _STATES.get(record.get_status(refresh=False)) in ("finished", "failed", "stopped"):
@@ -110,7 +110,7 @@ def take_back_tile(connection: redis.Redis, job_id: str, generation: int, tile: 
 def withdraw_tiles(connection: redis.Redis, job_id: str, generation: int, tiles: int | None) -> None:
     """Remove the waiting tiles of a generation from the queue. tiles: their number; None for a scene in one piece."""
     for tile in range(1, (tiles or 0) + 1):
-        lines.withdraw(connection, unit_id(job_id, generation, tile))
+        lines.withdraw(connection, unit_id(job_id, generation, tile), keep=0)
 
 
 def status(connection: redis.Redis, job_id: str, generation: int) -> QueueStatus:

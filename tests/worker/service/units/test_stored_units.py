@@ -14,7 +14,7 @@ from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import TrainOptions
 from splatmill_worker.service.units.stored_units import VERSION, StoredUnits
-from splatmill_worker.tiles.folder import DONE, PLAN, PlanFolder
+from splatmill_worker.tiles.folder import DONE, PLAN, PlanFolder, facts_of
 from splatmill_worker.tiles.units import ScenePlan
 
 JOB = "job00001"
@@ -97,3 +97,19 @@ def test_the_plan_of_another_version_is_not_followed(storage: Storage) -> None:
     document = json.loads(storage.get(path))
     storage.put(path, json.dumps(document | {VERSION: "0.0.0"}).encode())
     assert units.plan() is None
+
+
+def test_the_output_that_is_stored_is_preferred_to_that_of_another_run(
+    storage: Storage, here: PlanFolder, there: PlanFolder
+) -> None:
+    units = StoredUnits(storage, JOB)
+    units.put(here.output("cameras"))
+    with there.claimed("cameras") as run:
+        run.publish({"photos": 2})
+    units.drop_others(here)
+    units.drop_others(there)
+    assert (here.states(), there.states()) == ({"cameras": "done"}, {})
+    units.bring(there, only=("coarse",))
+    assert there.states() == {}
+    units.bring(there)
+    assert facts_of(there.output("cameras")) == {"photos": 3}

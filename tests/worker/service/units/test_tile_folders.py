@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import pytest
 import redis
 
 from splatmill.backplane import keys
 from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.storage import Storage
 from splatmill_worker.service.abandoned_folders import remove_abandoned, tidy
-from splatmill_worker.service.job_folder import JobFolder, TileFolder
+from splatmill_worker.service.job_folder import JobFolder, TileFolder, remove_remade
 from tests.support.jobs import CAPTURE, write_row
 
 JOB = "job00001"
@@ -55,10 +56,26 @@ def test_an_attempt_on_another_machine_gets_units_by_their_plan_alone(remote: St
     assert list(remote.entries(layout.job(JOB))) == []
 
 
-def test_what_units_made_is_deleted_from_a_folder_of_this_machine_too(local: Storage) -> None:
-    folder = JobFolder(local, JOB, CAPTURE)
-    (folder.run / "tiles").mkdir(parents=True)
-    local.put(f"{layout.job_units(JOB)}/plan.json", b"{}")
+@pytest.mark.parametrize("where", ["local", "remote"])
+def test_units_outlive_a_failure_of_the_job_and_go_with_its_end(
+    where: str, request: pytest.FixtureRequest
+) -> None:
+    storage: Storage = request.getfixturevalue(where)
+    folder = JobFolder(storage, JOB, CAPTURE)
+    units = folder.run / "tiles" / "units"
+    for path in (
+        "checkpoints/1",
+        "tiles/units/coarse-1/done.json",
+        "tiles/units/tile-1-1.ab.work/frames/1.jpg",
+    ):
+        (folder.run / path).parent.mkdir(parents=True)
+        (folder.run / path).touch()
+    plan = f"{layout.job_units(JOB)}/plan.json"
+    storage.put(plan, b"{}")
     folder.reset()
-    assert list(local.entries(layout.job(JOB))) == []
-    assert folder.path.exists()
+    assert storage.exists(plan)
+    assert sorted(path.name for path in folder.run.iterdir()) == ["tiles"]
+    assert remove_remade(folder.path)
+    assert [path.name for path in units.iterdir()] == ["coarse-1"]
+    folder.remove()
+    assert list(storage.entries(layout.job(JOB))) == []

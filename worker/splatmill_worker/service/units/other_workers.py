@@ -35,6 +35,7 @@ class OtherWorkers:
     def begin(self, folder: PlanFolder) -> None:
         """Store the plan and what this machine has done of it, and bring what earlier attempts have done elsewhere."""
         self._units.put_plan(folder.plan)
+        self._units.drop_others(folder)
         self.gather(folder)
         for ended in folder.ended().values():
             if ended.path is not None:

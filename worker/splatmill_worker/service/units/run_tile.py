@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -28,6 +29,9 @@ from splatmill_worker.tiles.units import tile_name
 
 POLL_SECONDS = 0.5
 """Seconds between two questions whether the job still runs."""
+
+RESTORE_SECONDS = 30.0
+"""Seconds without a row of the job after which it counts as deleted."""
 
 log = logging.getLogger("splatmill.attempt")
 
@@ -66,11 +70,10 @@ def run_tile(entry: TileEntry) -> None:
 
     try:
         _train(entry, row, stopped)
-    except Exception:
+    except Exception as caught:
         if hand_back.requested():
             os._exit(HANDED_BACK_STATUS)
-        if disk.error is not None:
-            error = disk.error
+        error = disk.error or caught
         if not isinstance(error, WorkerError):
             raise
         log.warning("tile %d of the job %s failed here: %s", entry.tile, entry.job_id, error)
@@ -96,7 +99,7 @@ def _train(entry: TileEntry, row: JobRow, stopped: Callable[[], bool]) -> None:
         tiles = PlanFolder(folder.run, plan)
         tiles.place(folder.capture)
         tiles.release()
-        units.bring(tiles)
+        units.bring(tiles, only=(*plan.unit(name).needs, name))
         if name in tiles.states() or tiles.plan.missing(name, tiles.states()):
             return
         # Not imported by the worker that forks this process: numpy and the decoders start threads.
@@ -133,9 +136,16 @@ class _JobWatch:
         self._thread.join()
 
     def _run(self) -> None:
+        known = time.monotonic()
         while not self._stop.wait(POLL_SECONDS):
             try:
-                if _row_to_help(self._entry) is None:
-                    os._exit(WITHDRAWN_STATUS)
+                if rows.read(self._entry.connection, self._entry.job_id) is not None:
+                    known = time.monotonic()
+                    over = _row_to_help(self._entry) is None
+                else:
+                    # Deleted, or in a Redis that came back empty and that a server fills again.
+                    over = time.monotonic() - known > RESTORE_SECONDS
             except redis.RedisError:
                 continue
+            if over:
+                os._exit(WITHDRAWN_STATUS)

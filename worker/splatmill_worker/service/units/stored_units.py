@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from splatmill import __version__
@@ -59,11 +59,25 @@ class StoredUnits:
             for path, name in zip(files, names, strict=True):
                 self._storage.put(f"{target}/{name}", path)
 
-    def bring(self, folder: PlanFolder) -> list[tuple[str, int]]:
-        """Copy the outputs that the folder of the plan lacks into it. Return the names and sizes of their files."""
+    def drop_others(self, folder: PlanFolder) -> None:
+        """Remove outputs from the folder of the plan where others are stored, which tiles may follow from."""
+        for ended in folder.ended().values():
+            if ended.path is None:
+                continue
+            stored = f"{self._prefix}/{ended.path.name}/{DONE}"
+            if self._storage.exists(stored) and self._storage.get(stored) != (ended.path / DONE).read_bytes():
+                shutil.rmtree(ended.path)
+
+    def bring(self, folder: PlanFolder, only: Sequence[str] | None = None) -> list[tuple[str, int]]:
+        """Copy the outputs that the folder of the plan lacks into it. Return the names and sizes of their files.
+
+        only: names of the units whose outputs are wanted; None: all.
+        """
         wanted: dict[str, dict[str, Entry]] = defaultdict(dict)
         for entry in self._storage.entries(self._prefix):
             output, _, name = entry.path.removeprefix(f"{self._prefix}/").partition("/")
+            if only is not None and output.rpartition("-")[0] not in only:
+                continue
             if name and not (folder.root / UNITS / output / DONE).is_file():
                 wanted[output][name] = entry
         brought = []

@@ -1,0 +1,66 @@
+"""How a tile that another worker has ended is settled: by its own error, or by that of the disk.
+
+Does not prove that a tile is trained: tests/service/test_tiles.py does.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import pytest
+import redis
+
+from splatmill.backplane.storage.storage import Storage
+from splatmill.schema import TrainOptions
+from splatmill_worker.service.job_folder import TileFolder
+from splatmill_worker.service.units.run_tile import TileEntry, run_tile
+from splatmill_worker.service.units.stored_units import StoredUnits
+from splatmill_worker.tiles.folder import PlanFolder, digest_of
+from splatmill_worker.tiles.units import ScenePlan
+from tests.support.jobs import CAPTURE, write_row
+
+JOB = "job00001"
+
+
+@pytest.fixture
+def entry(
+    local: Storage, connection: redis.Redis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> TileEntry:
+    """A tile whose coarse model is stored without its files."""
+    monkeypatch.setenv("SPLATMILL_STORAGE", (tmp_path / "storage").as_uri())
+    options = TrainOptions(tiles=2)
+    write_row(connection, JOB, options=options)
+    staged = TileFolder(local, JOB, CAPTURE)
+    staged.stage_capture()
+    plan = ScenePlan(digest_of(staged.capture), options)
+    staged.close()
+    made, units = PlanFolder(tmp_path / "made", plan), StoredUnits(local, JOB)
+    units.put_plan(plan)
+    for name in ("cameras", "coarse"):
+        with made.claimed(name) as run:
+            run.publish({})
+        units.put(made.output(name))
+    return TileEntry(connection, JOB, 1, 1)
+
+
+def test_an_error_of_the_system_is_for_the_queue_to_try_again(entry: TileEntry) -> None:
+    with pytest.raises(FileNotFoundError, match="coarse"):
+        run_tile(entry)
+
+
+def test_a_failure_with_a_name_leaves_the_tile_to_the_attempt(
+    entry: TileEntry, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("SPLATMILL_DISK_RESERVE", "1000TB")
+    with caplog.at_level(logging.WARNING, "splatmill.attempt"):
+        run_tile(entry)
+    assert "failed here" in caplog.text
+    assert "stay free" in caplog.text
+
+
+def test_a_tile_of_a_job_that_is_gone_is_dropped(entry: TileEntry, caplog: pytest.LogCaptureFixture) -> None:
+    write_row(entry.connection, JOB, generation=2)
+    with caplog.at_level(logging.INFO, "splatmill.attempt"):
+        run_tile(entry)
+    assert "no longer" in caplog.text
