@@ -119,6 +119,7 @@ NO_DECISION = {
     "matcher": "the cameras are given",
     "sfm_effort": "the cameras are given",
     "scale": "refused where cameras are given",
+    "tiles": "another way to train, whose parts have these plans",
 }
 """Fields that no factor sets, and why."""
 

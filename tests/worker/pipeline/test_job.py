@@ -256,3 +256,8 @@ def test_a_blender_set_with_alpha_and_its_own_split(tmp_path: Path) -> None:
     assert len([row for row in report["views"] if row["split"] == "test"]) == 25
     assert report["plan"]["background"] == "random"
     assert report["result"]["psnr"] > 20.0
+
+
+def test_tiles_are_not_ignored(tmp_path: Path) -> None:
+    with pytest.raises(Refusal, match="tiles is 4, and this run trains a scene in one piece"):
+        pipeline.run(tmp_path, tmp_path / "work", TrainOptions(tiles=4), lambda _: None, lambda: False)

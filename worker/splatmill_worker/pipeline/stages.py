@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splatmill.schema import JobState, PlanEvent, StateEvent, TrainOptions
-from splatmill_worker.errors import Cancelled
+from splatmill_worker.errors import Cancelled, Refusal
 from splatmill_worker.pipeline.cameras import recover_cameras
 from splatmill_worker.pipeline.events import Emit
 from splatmill_worker.pipeline.files import write_files
@@ -57,6 +57,12 @@ def run(
 
     Raises Refusal, SfmFailed and TrainingFailed (see `errors`).
     """
+    if options.tiles is not None:
+        raise Refusal(
+            "option_out_of_range",
+            f"The option tiles is {options.tiles}, and this run trains a scene in one piece.",
+            advice="splatmill_worker.tiles.job.run trains it in tiles, with the same arguments.",
+        )
     stages = Stages(workdir / "stages.json")
     try:
         looks = None if onlookers is None else Looks(onlookers)
