@@ -142,7 +142,7 @@ def test_a_worker_that_is_killed_with_a_tile_costs_nothing_but_time(
 ) -> None:
     worker = other()
     job_id = submitted(service, photos)
-    wait_for(lambda: worker.tiles(job_id) and worker.trains())
+    wait_for(lambda: worker.tiles(job_id) and worker.trains(), 120)
     for pid in [worker.process.pid] if whole else worker.trains()[:1]:
         os.kill(pid, signal.SIGKILL)
     assert model_of(service, job_id) == undisturbed
@@ -153,7 +153,7 @@ def test_a_worker_that_is_stopped_gives_its_tile_back(
 ) -> None:
     worker = other()
     job_id = submitted(service, photos)
-    wait_for(lambda: worker.tiles(job_id) and worker.trains())
+    wait_for(lambda: worker.tiles(job_id) and worker.trains(), 120)
     worker.process.send_signal(signal.SIGTERM)
     assert worker.process.wait(30) == 0
     assert model_of(service, job_id) == undisturbed
@@ -163,7 +163,7 @@ def test_units_that_were_done_are_not_repeated_by_the_next_attempt(
     service: Up, photos: Path, undisturbed: str
 ) -> None:
     job_id = submitted(service, photos)
-    wait_for(lambda: any(line.startswith("tile-1 is trained") for line in lines_of(service, job_id)))
+    wait_for(lambda: any(line.startswith("tile-1 is trained") for line in lines_of(service, job_id)), 120)
     os.kill(service.worker, signal.SIGKILL)
     assert model_of(service, job_id) == undisturbed
     assert service.job(job_id)["attempt"] == 2
@@ -180,7 +180,9 @@ def test_a_cancellation_ends_the_tiles_of_all_workers(
     below = worker.trains()
     service.http.post(f"/v1/jobs/{job_id}/cancel")
     assert service.ended(job_id)["state"] == "cancelled"
-    wait_for(lambda: gone(below), 2)
+    wait_for(lambda: gone(below))
+    # Not because the tile was trained meanwhile.
+    wait_for(lambda: "has ended: stopped" in worker.log.read_text())
     with service.redis() as connection:
         wait_for(lambda: queue.take_back_tile(connection, job_id, 1, 3))
 
