@@ -177,10 +177,9 @@ def _do(work: _Work, name: str) -> None:
         try:
             run_unit(context)
         except WorkerError as error:
-            lacked_memory = isinstance(
-                error, TrainingFailed
-            )  # and would again, on the worker that has the job
-            if name not in folder.plan.tile_names or (may_pass(error) and not lacked_memory):
+            # Memory that a tile lacks here would be lacking again: no other worker is left to train it.
+            passes = may_pass(error) and not isinstance(error, TrainingFailed)
+            if name not in folder.plan.tile_names or passes:
                 raise
             run.fail(error.message, error.advice or "")
             work.emit(LogEvent(level="warning", message=f"{name} failed: {error}"))
