@@ -38,6 +38,7 @@ class TrainArguments(TypedDict, total=False):
     target_psnr: float | None
     max_gaussians: int | None
     max_memory: int | str | None
+    tiles: int | None
     image_size: int | None
     holdout: int
     test_views: Sequence[str] | None

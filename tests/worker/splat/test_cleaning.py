@@ -29,7 +29,7 @@ EACH = 4
 def planted(kind: Reason, views: list[TrainingView]) -> Gaussians:
     """EACH Gaussians of a kind in pure magenta, which the still life does not have, where the views look."""
     rows = []
-    for view in views[:EACH]:
+    for view in views[-EACH:]:
         camera = view.full.camera
         ahead = torch.from_numpy(camera.to_world(torch.tensor([[0.05, -0.05, 1.0]]).numpy())[0]).float()
         toward = ahead - torch.from_numpy(camera.center).float()
@@ -37,7 +37,7 @@ def planted(kind: Reason, views: list[TrainingView]) -> Gaussians:
         depth, scales, opacity = {
             "giant": (0.6, (-1.2, -1.2, -1.2), 0.5),
             "needle": (0.8, (-2.0, -6.0, -6.0), 0.9),
-            "island": (0.65, (-4.5, -4.5, -4.5), 0.9),
+            "island": (0.8, (-5.0, -5.0, -5.0), 0.9),
             "floater": (0.25, (-4.0, -4.0, -4.0), 0.7),
         }[kind]
         rows.append(

@@ -85,7 +85,8 @@ def model_of(root: Path) -> bytes:
 
 
 def test_the_scene_is_as_good_as_in_one_piece(whole: Path, tmp_path: Path) -> None:
-    outcome = pipeline.run(whole / "photos", tmp_path, OPTIONS, lambda event: None, lambda: False)
+    in_one_piece = OPTIONS.model_copy(update={"tiles": None})
+    outcome = pipeline.run(whole / "photos", tmp_path, in_one_piece, lambda event: None, lambda: False)
     assert outcome.trained is not None
     assert outcome.trained.held_out is not None
     ended = PlanFolder.open(whole).ended()
