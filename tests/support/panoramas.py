@@ -114,40 +114,45 @@ def fisheye(
     angle = np.hypot(x, y)
     across = np.sinc(angle / np.pi)
     rays = np.stack([x * across, y * across, np.cos(angle)], axis=-1)
-    photo = seen_along(scene, viewmat, rays, round(focal * np.pi / 2 * 1.3), samples)
-    photo[angle > np.radians(degrees) / 2] = 0
+    photo = np.zeros((height, width, 3), np.uint8)
+    seen = angle <= np.radians(degrees) / 2
+    photo[seen] = seen_along(scene, viewmat, rays[seen], round(focal * np.pi / 2 * 1.3), samples)
     return photo
 
 
 def seen_along(
     scene: StillLife, viewmat: np.ndarray, rays: np.ndarray, side: int, samples: int
 ) -> np.ndarray:
-    """What a camera sees along rays [H,W,3] of its frame, uint8 [H,W,3], looked up in the faces of a cube.
+    """What a camera sees along rays [...,3] of its frame, uint8 [...,3], looked up in the faces of a cube.
 
-    side: pixels of a face.
+    Of a face, only the rectangle is rendered that the rays fall into. side: pixels of a face.
     """
     largest = np.abs(rays).argmax(axis=-1)
     result = np.zeros(rays.shape, np.uint8)
     for (axis, sign), axes in CUBE.items():
         rows = (largest == axis) & (rays[..., axis] * sign > 0)
+        if not rows.any():
+            continue
         rotation = np.array(axes, np.float64)
         # A little more than 90 degrees, so that every ray has four pixels around it.
         focal = side / 2 / 1.02
-        camera = Camera(
-            side,
-            side,
-            focal,
-            focal,
-            side / 2,
-            side / 2,
-            viewmat_of(rotation @ viewmat[:3, :3], -viewmat[:3, :3].T @ viewmat[:3, 3]),
-        )
-        pixels = picture(scene, camera, samples).astype(np.float64)
         local = rays[rows] @ rotation.T
         x = local[:, 0] / local[:, 2] * focal + side / 2 - 0.5
         y = local[:, 1] / local[:, 2] * focal + side / 2 - 0.5
         left, top = np.floor(x).astype(int), np.floor(y).astype(int)
+        first, upmost = int(left.min()), int(top.min())
+        camera = Camera(
+            int(left.max()) + 2 - first,
+            int(top.max()) + 2 - upmost,
+            focal,
+            focal,
+            side / 2 - first,
+            side / 2 - upmost,
+            viewmat_of(rotation @ viewmat[:3, :3], -viewmat[:3, :3].T @ viewmat[:3, 3]),
+        )
+        pixels = picture(scene, camera, samples).astype(np.float64)
         u, v = (x - left)[:, None], (y - top)[:, None]
+        left, top = left - first, top - upmost
         upper = pixels[top, left] * (1 - u) + pixels[top, left + 1] * u
         lower = pixels[top + 1, left] * (1 - u) + pixels[top + 1, left + 1] * u
         result[rows] = np.round(upper * (1 - v) + lower * v).astype(np.uint8)

@@ -82,7 +82,7 @@ def test_cameras_of_full_frame_fisheyes_are_recovered_by_the_name_of_their_lens(
     recovered_as_taken(tmp_path, truth, focal)
 
 
-def round_pictures(images: Path, focal: float, count: int, step: float) -> dict[str, Float]:
+def round_pictures(images: Path, focal: float, count: int, step: float, samples: int = 1) -> dict[str, Float]:
     """Photos of an ordinary lens in a round frame, `step` radians apart; their poses by name."""
     images.mkdir()
     truth = {}
@@ -92,7 +92,7 @@ def round_pictures(images: Path, focal: float, count: int, step: float) -> dict[
         angle = step * number
         eye = 2.6 * np.array([np.cos(angle), np.sin(angle), 0.35])
         camera = look_at(eye, np.array([0.0, 0.0, 0.2]), 480, 360, focal)
-        pixels = picture(panoramas.room(), camera, 2)
+        pixels = picture(panoramas.room(), camera, samples)
         pixels[outside] = 0
         name = f"{number}.jpg"
         Image.fromarray(pixels).save(images / name, quality=95, subsampling=0)
@@ -112,7 +112,7 @@ def test_round_pictures_of_an_ordinary_lens_have_its_angle(tmp_path: Path) -> No
 
 def test_where_more_are_placed_as_photos_of_an_ordinary_lens_they_are_taken_for_those(tmp_path: Path) -> None:
     """A tenth of the angle of a fisheye, as of a microscope. Does not prove that such photos are placed well."""
-    round_pictures(tmp_path / "images", 1400.0, 8, 0.12)
+    round_pictures(tmp_path / "images", 1400.0, 8, 0.12, samples=2)
     scene = recovered(tmp_path / "images", tmp_path / "work")
     assert any(said.startswith("As photos of a fisheye lens, 0 of 8 were placed") for said in scene.notes)
     assert not any("taken for those of a fisheye lens, by" in said for said in scene.notes)

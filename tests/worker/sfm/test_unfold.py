@@ -63,8 +63,27 @@ def can(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Camer
     return folder, cameras
 
 
-def test_a_can_with_two_alike_sides_keeps_both(can: tuple[Path, dict[str, Camera]], tmp_path: Path) -> None:
-    scene = reconstruct(can[0], tmp_path)
+@pytest.fixture(scope="module")
+def solved(
+    can: tuple[Path, dict[str, Camera]], tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Scene, Path]:
+    """The scene of the can, and its work folder."""
+    workdir = tmp_path_factory.mktemp("solved")
+    return reconstruct(can[0], workdir), workdir
+
+
+@pytest.fixture
+def matched(solved: tuple[Scene, Path], tmp_path: Path) -> Path:
+    """A work folder with the features and the matches of the can, and no model."""
+    workdir = tmp_path / "matched"
+    shutil.copytree(solved[1], workdir, ignore=shutil.ignore_patterns("model-*", unfold.UNFOLDED))
+    return workdir
+
+
+def test_a_can_with_two_alike_sides_keeps_both(
+    can: tuple[Path, dict[str, Camera]], solved: tuple[Scene, Path]
+) -> None:
+    scene, _ = solved
     assert len(scene.views) == COUNT
     assert scene.facts["pairs_alike"] > 0
     (note,) = [note for note in scene.notes if "look alike" in note]
@@ -76,16 +95,16 @@ def test_a_can_with_two_alike_sides_keeps_both(can: tuple[Path, dict[str, Camera
 
 
 def test_without_the_check_the_sides_lie_on_each_other(
-    can: tuple[Path, dict[str, Camera]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    can: tuple[Path, dict[str, Camera]], matched: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(solve, "unfold", lambda *_: None)
-    scene = reconstruct(can[0], tmp_path)
+    scene = reconstruct(can[0], matched)
     assert turns(scene).max() > 90.0
     assert pose_errors(scene, can[1])[0].max() > 90.0
 
 
 def test_where_too_few_photos_would_be_left_the_model_is_kept_and_doubted(
-    can: tuple[Path, dict[str, Camera]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    can: tuple[Path, dict[str, Camera]], matched: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     kept: list[EffortResult] = []
 
@@ -95,7 +114,7 @@ def test_where_too_few_photos_would_be_left_the_model_is_kept_and_doubted(
 
     monkeypatch.setattr(unfold, "KEPT_REGISTERED", 2.0)
     monkeypatch.setattr(solve, "unfold", keep)
-    scene = reconstruct(can[0], tmp_path)
+    scene = reconstruct(can[0], matched)
     (note,) = [note for note in scene.notes if "look alike" in note]
     assert "gave no better cameras" in note
     assert scene.facts["pairs_alike"] == 0

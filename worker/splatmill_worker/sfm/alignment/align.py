@@ -11,11 +11,14 @@ import numpy.typing as npt
 from splatmill_worker.scene import Float, Similarity
 from splatmill_worker.sfm.alignment import icp, triangles
 from splatmill_worker.sfm.alignment.cells import spread
-from splatmill_worker.sfm.alignment.cloud import Cloud, degenerate
+from splatmill_worker.sfm.alignment.cloud import Cloud, Levels, degenerate
 from splatmill_worker.sfm.callbacks import OnProgress, stop_if
 
 SCENE_POINTS = 3_000
 """Points of the scene that are compared."""
+
+FIRST_POINTS = 1_000
+"""Points of the scene that a guess is first refined with: most guesses are wrong, and are left after that."""
 
 SPARSE, DENSE = (4_000, 20_000), 100_000
 """Points of the scan that the first guess is searched with, in turns: of a scan that has much more than the scene, many
@@ -181,7 +184,8 @@ def _search(
     """The similarity that triangles of equal colours lead to, again and again; that with the most points otherwise."""
     clouds = [scan.thinned(count) for count in SPARSE]
     palettes = [triangles.Palette.of(scene, each) for each in clouds]
-    exchanged = replace(scene, colors=scene.colors[random.permutation(len(scene.colors))])
+    exchanged = scene.colors[random.permutation(len(scene.colors))]
+    few = scene.thinned(FIRST_POINTS)
     best: list[_Place] = []
     for count in range(ROUNDS):
         stop_if(cancelled)
@@ -190,7 +194,7 @@ def _search(
         turn = count % len(clouds)
         scan, palette = clouds[turn], palettes[turn]
         for guess in triangles.guesses(scene, scan, palette, random):
-            moved = icp.refined(scene, scan, guess, 4.0 * scan.spacing * guess.scale, 8)
+            moved = icp.refined(few, scan, guess, 4.0 * scan.spacing * guess.scale, 8)
             reached.append((_score(scene, exchanged, scan, moved), moved))
         if not reached:
             continue
@@ -212,10 +216,10 @@ def _search(
     return best[0].similarity if best and best[0].score > 0.0 else None
 
 
-def _score(scene: Cloud, exchanged: Cloud, scan: Cloud, similarity: Similarity) -> float:
-    """Share of the points of the scene that the scan has, less that with their colours exchanged."""
-    limit = _near(scene, scan, similarity)
-    own, other = (len(icp.pairs(each, scan, similarity, limit).rows) for each in (scene, exchanged))
+def _score(scene: Cloud, exchanged: Levels, scan: Cloud, similarity: Similarity) -> float:
+    """Share of the points of the scene that the scan has, less that with the colours `exchanged` [n,3]."""
+    _, near = icp.nearest(scene, scan, similarity, _near(scene, scan, similarity))
+    own, other = (int(scan.alike(near, colors).any(axis=1).sum()) for colors in (scene.colors, exchanged))
     return (own - other) / len(scene.points)
 
 

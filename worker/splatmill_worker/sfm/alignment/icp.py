@@ -44,10 +44,19 @@ class Pairs:
     distances: Float
 
 
+def nearest(
+    scene: Cloud, scan: Cloud, similarity: Similarity, limit: float
+) -> tuple[Float, npt.NDArray[np.intp]]:
+    """Distances, in units of the scan, and rows of the points of the scan next to each point of the scene, within
+    `limit` [n,NEIGHBOURS]; past the end where there are fewer."""
+    moved = (scene.points - similarity.translation) @ similarity.rotation / similarity.scale
+    distances, rows = scan.tree.query(moved, k=NEIGHBOURS, distance_upper_bound=limit / similarity.scale)
+    return distances, rows
+
+
 def pairs(scene: Cloud, scan: Cloud, similarity: Similarity, limit: float) -> Pairs:
     """The points of the scene with a point of the scan, of the same colour, within `limit`."""
-    moved = (scene.points - similarity.translation) @ similarity.rotation / similarity.scale
-    distances, near = scan.tree.query(moved, k=NEIGHBOURS, distance_upper_bound=limit / similarity.scale)
+    distances, near = nearest(scene, scan, similarity, limit)
     alike = scan.alike(near, scene.colors)
     first = np.argmax(alike, axis=1)
     rows = np.flatnonzero(alike.any(axis=1))
