@@ -46,7 +46,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def trained(place: Path) -> pipeline.Outcome:
     """The same capture through the pipeline itself, in 40 steps."""
-    options = TrainOptions(steps=40, image_size=480, backend="cpu")
+    options = TrainOptions(steps=40, image_size=480, backend="cpu", lpips=Switch.off)
     return pipeline.run(place / "tiny", place / "trained", options, lambda _: None, lambda: False)
 
 

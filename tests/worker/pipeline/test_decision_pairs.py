@@ -19,7 +19,7 @@ import pytest
 from PIL import Image
 
 import splatmill.schema.options
-from splatmill.schema import Event, Report, TrainOptions
+from splatmill.schema import Event, Report, Switch, TrainOptions
 from splatmill_worker import pipeline
 from splatmill_worker.errors import Refusal
 from splatmill_worker.images.load import Photo, load_views
@@ -100,7 +100,7 @@ def capture(folder: Path, kinds: tuple[str, ...]) -> Path:
     given = scene("distorted" in kinds, not transparent)
     model_of(list(given.views), given.points, given).write_binary(str(folder / "poses"))
     if "model" in kinds:
-        asked = TrainOptions(steps=150, seed=1)
+        asked = TrainOptions(steps=60, seed=1, lpips=Switch.off)
         outcome = pipeline.run(folder, folder / "first", asked, lambda _: None, lambda: False)
         shutil.move(outcome.out / "model.ply", folder / "poses" / "first.ply")
     return folder
@@ -126,6 +126,7 @@ def run(
     changes = decisions.ALWAYS | {name: value for each in forced for name, value in each.plan.items()}
     if "end" not in row:
         asked["steps"] = decisions.STEPS
+    asked.setdefault("lpips", "off")
     events: list[Event] = []
     outcome = pipeline.run(
         place,

