@@ -6,6 +6,7 @@ Does not prove SfM (its own tests do), nor quality on real photos beyond a floor
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
@@ -252,11 +253,20 @@ def test_real_photos_with_their_cameras(tmp_path: Path) -> None:
 @pytest.mark.skipif(not (DATA / "lego_400").is_dir(), reason="the shared photos are not on this machine")
 def test_a_blender_set_with_alpha_and_its_own_split(tmp_path: Path) -> None:
     asked = TrainOptions.model_validate({"image_size": 100, "steps": 100, "lpips": "off"})
-    out = run(DATA / "lego_400", tmp_path / "work", asked)[0].out
+    capture = tmp_path / "lego"
+    for split in ("train", "test"):
+        poses = json.loads((DATA / f"lego_400/transforms_{split}.json").read_text())
+        poses["frames"] = poses["frames"][::4]
+        (capture / split).mkdir(parents=True)
+        (capture / f"transforms_{split}.json").write_text(json.dumps(poses))
+        for frame in poses["frames"]:
+            name = f"{frame['file_path']}.png"
+            shutil.copy(DATA / "lego_400" / name, capture / name)
+    out = run(capture, tmp_path / "work", asked)[0].out
     report = json.loads((out / "report.json").read_text())
-    assert report["facts"]["views"] == 100
-    assert report["facts"]["transparent"] == 100
-    assert len([row for row in report["views"] if row["split"] == "test"]) == 25
+    assert report["facts"]["views"] == 25
+    assert report["facts"]["transparent"] == 25
+    assert len([row for row in report["views"] if row["split"] == "test"]) == 7
     assert report["plan"]["background"] == "random"
     assert report["result"]["psnr"] > 20.0
 

@@ -179,7 +179,7 @@ def test_a_scan_without_colours_is_not_aligned(scene: Scene) -> None:
 
 def test_a_scan_and_photos_alone(tmp_path: Path) -> None:
     capture = tmp_path / "capture"
-    truth = synthetic.capture(capture / "images", 16, 320, 240, samples=1)
+    truth = synthetic.capture(capture / "images", 12, 320, 240, samples=1)
     (capture / "poses").mkdir()
     points, colors = scanned()
     write_las(capture / "poses" / "scan.laz", TURN.points(points), colors)

@@ -24,7 +24,7 @@ from tests.support.made_once import made_once
 
 pytestmark = pytest.mark.slow
 
-COUNT, WIDTH = 10, 768
+COUNT, WIDTH = 10, 640
 
 
 @pytest.fixture(scope="session")

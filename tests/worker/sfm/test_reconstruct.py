@@ -40,7 +40,7 @@ def reconstruct(images: Path, workdir: Path, **options: Any) -> Scene:
 @pytest.fixture(scope="module")
 def still_life(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Camera]]:
     folder = tmp_path_factory.mktemp("still") / "images"
-    return folder, synthetic.capture(folder, 16, 480, 360, samples=1)
+    return folder, synthetic.capture(folder, 16, 400, 300, samples=1)
 
 
 @pytest.fixture(scope="module")
