@@ -18,7 +18,7 @@ from splatmill_worker.colmap import pycolmap
 from splatmill_worker.scene import Camera, Scene
 from splatmill_worker.sfm import solve, unfold
 from splatmill_worker.sfm.agreement import Poses, agreement
-from splatmill_worker.sfm.run import EffortResult, SfmRun
+from splatmill_worker.sfm.run import UNFOLDED, EffortResult, SfmRun
 from splatmill_worker.synthetic.ray_caster import Cylinder, Disc, StillLife, look_at, picture
 from splatmill_worker.synthetic.textures import MipMap, painted, sky
 from tests.support.paths import DATA
@@ -76,7 +76,7 @@ def solved(
 def matched(solved: tuple[Scene, Path], tmp_path: Path) -> Path:
     """A work folder with the features and the matches of the can, and no model."""
     workdir = tmp_path / "matched"
-    shutil.copytree(solved[1], workdir, ignore=shutil.ignore_patterns("model-*", unfold.UNFOLDED))
+    shutil.copytree(solved[1], workdir, ignore=shutil.ignore_patterns("model-*", UNFOLDED))
     return workdir
 
 
