@@ -175,8 +175,8 @@ def bench() -> Iterator[Bench]:
         )
         captures = place / "captures"
         captures.mkdir()
-        # As in an attempt: see service/attempts/run_attempt.
-        stack.enter_context(decoders.confined([captures]))
+        # As in an attempt (service/attempts/run_attempt), but for the reader, whose start would take most of the time.
+        stack.enter_context(decoders.confined([captures], keep_reader=True))
         yield Bench(stack.enter_context(served_app(settings, client)), captures / "one")
 
 

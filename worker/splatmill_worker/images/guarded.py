@@ -19,8 +19,8 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import av
 import pillow_heif
 from PIL import Image, UnidentifiedImageError
 
@@ -29,6 +29,9 @@ from splatmill_worker import memory
 from splatmill_worker.errors import UnusablePicture, UnusableVideo
 from splatmill_worker.images.signatures import recognised
 from splatmill_worker.wording import plain
+
+if TYPE_CHECKING:
+    import av
 
 pillow_heif.register_heif_opener()
 
@@ -160,6 +163,8 @@ def avif_tags(path: Path) -> tuple[int, int]:
 
     They are 2, unspecified, where FFmpeg cannot read the file.
     """
+    import av  # FFmpeg takes a quarter of the start of a decoding process, which most photos do not need
+
     options = {
         "protocol_whitelist": "file",
         "format_whitelist": "mov",
@@ -203,6 +208,8 @@ def opened_video(path: Path) -> Iterator[tuple[av.container.InputContainer, av.V
     Raises UnusableVideo when it cannot be opened, has no video, or declares larger frames or more of them than the
     limits allow.
     """
+    import av
+
     try:
         container = av.open(
             str(path),

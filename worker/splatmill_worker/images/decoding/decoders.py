@@ -97,16 +97,22 @@ _active: Decoders | None = None
 
 @contextmanager
 def confined(
-    read: list[Path], ended: Path | None = None, cancelled: Callable[[], bool] = lambda: False
+    read: list[Path],
+    ended: Path | None = None,
+    cancelled: Callable[[], bool] = lambda: False,
+    *,
+    keep_reader: bool = False,
 ) -> Iterator[Decoders]:
     """Let decoding processes open the files of strangers within the block.
 
     read: the files and folders that they may open.
     ended: a file with the list of files that have ended their process twice, which the next attempt does not open.
     cancelled: whether the reader of a model (`call_once`), which takes minutes for some, is to end.
+    keep_reader: let one process answer all of `call_once`, as programs wish that read thousands of models; it takes
+        the memory of its libraries until the block ends.
     """
     global _active
-    decoders = Decoders(read, ended, cancelled=cancelled)
+    decoders = Decoders(read, ended, cancelled=cancelled, keep_reader=keep_reader)
     _active = decoders
     try:
         yield decoders
@@ -155,14 +161,10 @@ def call_once(
     """
     if _active is None:
         return check(function(path, *arguments))
-    limit = reader_memory.limit()
-    own = Decoders(_active.read, processes=1, limit=limit, libraries=OWN_MEMORY + memory.mapped_files())
-    try:
-        most = limit // ANSWER_SHARE
+    with _active.reader() as own:
+        most = own.limit // ANSWER_SHARE
         asked = Call(function, path, arguments, READING_SECONDS, most, cancelled=_active.cancelled)
         return own.call(asked, check, fault)
-    finally:
-        own.close()
 
 
 def decode(path: Path, *, at_least: tuple[int, int] | None = None, upright: bool = True) -> Image.Image:
@@ -253,7 +255,7 @@ class Decoders:
 
     held: what confines them, as `sandbox.confine` returns it; None before the first answer.
     read: the files and folders that they may open.
-    cancelled: of `confined`.
+    cancelled, keep_reader: of `confined`.
     limit, libraries: bytes of address space of each for what it reads, by default `memory_limit()`, and besides that.
     """
 
@@ -266,6 +268,7 @@ class Decoders:
         limit: int | None = None,
         libraries: int = LIBRARIES,
         cancelled: Callable[[], bool] = lambda: False,
+        keep_reader: bool = False,
     ) -> None:
         self.read = read
         self.cancelled = cancelled
@@ -273,8 +276,10 @@ class Decoders:
         self._room = tempfile.TemporaryFile()  # noqa: SIM115  # closed by `close`
         self._root = read[0] if read else Path("/")
         self._ended = EndedFiles(ended)
-        limit = memory_limit() if limit is None else limit
+        self.limit = limit = memory_limit() if limit is None else limit
         self._memory = limit + libraries
+        self._keep_reader = keep_reader
+        self._reader: Decoders | None = None
         self._start = {
             "read": [str(path) for path in read],
             "memory": self._memory,
@@ -337,6 +342,21 @@ class Decoders:
         call = Call(video.keyframes, path, (count,), seconds, MAX_ARRAYS, part, cancelled)
         self.call(call, lambda value: None, lambda code, name, reason: UnusableVideo(name, reason))
 
+    @contextmanager
+    def reader(self) -> Iterator[Decoders]:
+        """One process that may take all the memory that is free, for a call; see `call_once`."""
+        own = self._reader
+        if own is None:
+            limit = reader_memory.limit()
+            own = Decoders(self.read, processes=1, limit=limit, libraries=OWN_MEMORY + memory.mapped_files())
+        self._reader = own if self._keep_reader else None
+        try:
+            yield own
+        finally:
+            own.forget_ended()  # a kept one may be given another file under the same name
+            if not self._keep_reader:
+                own.close()
+
     def ready(self) -> tuple[str, ...]:
         """Wait until a process is confined, and return what holds. Raises DecoderNotStarted."""
         process = None
@@ -361,6 +381,8 @@ class Decoders:
 
     def close(self) -> None:
         """End the processes. No call may be under way."""
+        if self._reader is not None:
+            self._reader.close()
         for _ in range(self._processes):
             process = self._free.get()
             if process is not None:
