@@ -21,7 +21,7 @@ ASSETS = re.compile(r'<(?:script|img|source|iframe)\b[^>]*\ssrc="([^"]+)"|<link\
 STYLED = re.compile(r"url\(\s*[\"']?(https?:)?//|@import\s+[\"'](https?:)?//")
 
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]  # on a loaded machine Sphinx takes minutes
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")

@@ -46,13 +46,6 @@ class Trained:
         return float(self.report["result"]["psnr"])
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Give these tests, which train, more time than others where the machine has other work."""
-    for item in items:
-        if item.path.parent == Path(__file__).parent:
-            item.add_marker(pytest.mark.timeout(900))
-
-
 @pytest.fixture(scope="session")
 def built(tmp_path_factory: pytest.TempPathFactory) -> Build:
     """A function (name, *kind) that builds an input once in a run of the tests. Its folder must not be changed."""

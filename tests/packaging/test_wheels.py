@@ -159,7 +159,7 @@ def test_the_three_wheels_train_a_scene_from_the_command_line(whole: Path, tmp_p
         *(whole / "splatmill", "train", "photos", "-o", "out", "--steps", "30", "--image-size", "120"),
         cwd=tmp_path,
         env=environment,
-        timeout=250,
+        timeout=600,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     model = (tmp_path / "out" / "model.ply").read_bytes()

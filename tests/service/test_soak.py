@@ -22,7 +22,7 @@ KINDS = (
 
 @pytest.mark.slow
 def test_a_fault_of_each_kind_loses_nothing() -> None:
-    *faults, end = soak.soak(s3=False, count=0, seed=1, only=KINDS, patience=3.0)
+    *faults, end = soak.soak(s3=False, count=0, seed=1, only=KINDS, patience=8.0)
     assert {row["fault"] for row in faults} | end["left_out"].keys() >= set(KINDS)
     assert end["complaints"] == []
     assert end["succeeded"] + end["cancelled"] == end["jobs"]

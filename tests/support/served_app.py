@@ -101,7 +101,7 @@ def served_app(settings: Settings, connection: redis.Redis) -> Iterator[ServedAp
     finally:
         app.state.service.closing.set()
         server.should_exit = True
-        thread.join(60)
+        thread.join(180)
         assert not thread.is_alive()
         listener.close()
 

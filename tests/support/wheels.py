@@ -60,7 +60,7 @@ def build(folder: Path, out: Path, *formats: str) -> Built:
     `formats` are options of `python -m build`: `--sdist` and `--wheel`, or none for an sdist and a wheel made from it.
     """
     done = run(
-        sys.executable, "-m", "build", "--no-isolation", *formats, "--outdir", out, folder, timeout=280
+        sys.executable, "-m", "build", "--no-isolation", *formats, "--outdir", out, folder, timeout=600
     )
     assert done.returncode == 0, done.stdout + done.stderr
     (wheel,), (sdist,) = out.glob("*.whl"), out.glob("*.tar.gz")

@@ -129,7 +129,11 @@ def main(count: int) -> None:
 
 @contextmanager
 def _nothing_to_decode(
-    read: list[Path], ended: Path | None = None, cancelled: Callable[[], bool] = lambda: False
+    read: list[Path],
+    ended: Path | None = None,
+    cancelled: Callable[[], bool] = lambda: False,
+    *,
+    keep_reader: bool = False,
 ) -> Iterator[decoders.Decoders]:
     yield cast(decoders.Decoders, None)  # an attempt does not use it
 

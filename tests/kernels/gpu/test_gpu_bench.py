@@ -49,7 +49,7 @@ def test_it_runs_dry_and_every_part_leaves_its_rows(tmp_path: Path) -> None:
     out = tmp_path / "dry.jsonl"
     done = subprocess.run(
         [sys.executable, "-W", "ignore", str(BENCH / "gpu.py"), "--dry", "--out", str(out)],
-        capture_output=True, text=True, check=False, timeout=240,
+        capture_output=True, text=True, check=False, timeout=600,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     rows = [json.loads(line) for line in out.read_text().splitlines()]

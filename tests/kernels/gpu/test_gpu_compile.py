@@ -51,7 +51,7 @@ def compiled() -> list[dict[str, object]]:
     running = [start("90"), start("--first", "80")]
     rows = []
     for process in running:
-        said, complained = process.communicate(timeout=280)
+        said, complained = process.communicate(timeout=600)
         assert process.returncode == 0, complained
         rows += [json.loads(line) for line in said.splitlines()]
     return rows

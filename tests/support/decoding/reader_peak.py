@@ -18,7 +18,7 @@ def peaks(function: str, paths: list[Path]) -> list[tuple[int, str]]:
     function: as "module:function". The first path is read for what its reader imports.
     """
     command = [sys.executable, "-m", __name__, function, *map(str, paths)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=240)
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=600)
     rows = [line.split("\t", 1) for line in done.stdout.splitlines()]
     assert len(rows) == len(paths) - 1, done.stderr
     return [(int(size), said) for size, said in rows]

@@ -31,7 +31,7 @@ from splatmill_worker.splat.render import render
 from splatmill_worker.synthetic.ray_caster import photograph
 from tests.support import panoramas
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+pytestmark = pytest.mark.slow
 
 COUNT, WIDTH = 10, 256
 FISHEYE = 200.0

@@ -53,7 +53,7 @@ def program(*arguments: str) -> subprocess.Popen[str]:
 
 def done(*arguments: str) -> str:
     process = program(*arguments)
-    text, _ = process.communicate(timeout=250)
+    text, _ = process.communicate(timeout=600)
     assert process.returncode == 0, text
     return text
 
@@ -147,7 +147,7 @@ def test_the_bytes_are_the_same_whoever_does_the_units_and_one_of_them_is_killed
     killed.communicate()
     assert list(claims.glob("tile-1*.claim")), "the unit was not done when its process was killed"
     both = [program("splatmill", "unit", str(root)) for _ in range(2)]
-    texts = [process.communicate(timeout=250)[0] for process in both]
+    texts = [process.communicate(timeout=600)[0] for process in both]
     assert [process.returncode for process in both] == [0, 0], texts
     assert model_of(root) == model_of(whole)
     assert len(list(claims.iterdir())) == 5, "nothing but outputs is left"
