@@ -46,22 +46,28 @@ class Trained:
         return float(self.report["result"]["psnr"])
 
 
+def run_script(base: Path, *command: str) -> None:
+    """Run a script of the inputs, with the folder of the photos and cameras that all of them are made from."""
+    environment = {**os.environ, "PYTHONPATH": str(INPUTS), "SPLATMILL_REPRO_BASE": str(base)}
+    subprocess.run([sys.executable, *command], env=environment, cwd=ROOT, check=True, timeout=600)
+
+
 @pytest.fixture(scope="session")
 def built(tmp_path_factory: pytest.TempPathFactory) -> Build:
     """A function (name, *kind) that builds an input once in a run of the tests. Its folder must not be changed."""
     if not INPUTS.is_dir():
         pytest.skip("the shared inputs are not on this machine")
 
-    def run(base: Path, *command: str) -> None:
-        environment = {**os.environ, "PYTHONPATH": str(INPUTS), "SPLATMILL_REPRO_BASE": str(base)}
-        subprocess.run([sys.executable, *command], env=environment, cwd=ROOT, check=True, timeout=600)
-
     def build(name: str, *kind: str) -> Path:
-        base = made_once(tmp_path_factory, "inputs-base", lambda folder: run(folder, "-c", "import common"))
+        base = made_once(
+            tmp_path_factory, "inputs-base", lambda folder: run_script(folder, "-c", "import common")
+        )
         script = str(INPUTS / name / "build.py")
         whole = re.sub(r"[^\w-]", "_", "-".join(("inputs", name, *kind)))
         return (
-            made_once(tmp_path_factory, whole, lambda folder: run(base, script, str(folder / "input"), *kind))
+            made_once(
+                tmp_path_factory, whole, lambda folder: run_script(base, script, str(folder / "input"), *kind)
+            )
             / "input"
         )
 

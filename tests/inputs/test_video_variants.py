@@ -4,56 +4,70 @@ stamps that begin at one hour, and pixels that are not square."""
 from __future__ import annotations
 
 import math
+import pickle
 import shutil
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from PIL import Image
 
 from splatmill_worker import sfm
 from splatmill_worker.images.prepare import prepare
+from splatmill_worker.scene import Camera
 from splatmill_worker.synthetic.ray_caster import look_at, picture, still_life
-from tests.inputs.conftest import Build
+from tests.inputs.conftest import INPUTS, run_script
+from tests.support.made_once import made_once
 
-FRAMES, FOCAL_LENGTH = 45, 315.0
+FRAMES, FOCAL_LENGTH = 24, 315.0
 """Of the video, before it is encoded."""
 
 VIDEOS = {"hlg.mov": "HDR", "late.mkv": "does not name", "anamorphic.mp4": "not square"}
 """The videos, each with a part of its warning."""
 
 
-def cameras() -> list[npt.NDArray[np.float64]]:
-    """Matrices from the world to the camera of each frame."""
+def cameras() -> list[Camera]:
+    """The camera of each frame, three quarters of the way around the scene."""
     angles = [2 * math.pi * number / FRAMES * 0.75 for number in range(FRAMES)]
     eyes = [
         3.7 * np.array([math.cos(a) * math.cos(0.5), math.sin(a) * math.cos(0.5), math.sin(0.5)])
         for a in angles
     ]
-    return [look_at(eye, np.array([0, 0, 0.25]), 384, 288, FOCAL_LENGTH).viewmat for eye in eyes]
+    return [look_at(eye, np.array([0, 0, 0.25]), 384, 288, FOCAL_LENGTH) for eye in eyes]
 
 
-def only(built: Build, name: str, folder: Path) -> Path:
+@pytest.fixture(scope="session")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with `videos`, and `vid.npy`, the frames that the script of the inputs makes them from."""
+    if not INPUTS.is_dir():
+        pytest.skip("the shared inputs are not on this machine")
+
+    def make(folder: Path) -> None:
+        np.save(folder / "vid.npy", np.stack([picture(still_life(0), camera, 2) for camera in cameras()]))
+        (folder / "cameras.pkl").write_bytes(pickle.dumps({}))  # no photos are needed
+        run_script(folder, str(INPUTS / "video-variants" / "build.py"), str(folder / "videos"))
+
+    return made_once(tmp_path_factory, "inputs-videos", make)
+
+
+def only(made: Path, name: str, folder: Path) -> Path:
     images = folder / "images"
     images.mkdir()
-    shutil.copy(built("video-variants") / name, images)
+    shutil.copy(made / "videos" / name, images)
     return images
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", VIDEOS)
-def test_the_frames_have_the_colours_of_sdr(built: Build, name: str, tmp_path: Path) -> None:
+def test_the_frames_have_the_colours_of_sdr(made: Path, name: str, tmp_path: Path) -> None:
     """All frames but one at most, and one of them at 33.5 dB; the encoded SDR frames themselves are at 35."""
-    prepared = prepare(only(built, name, tmp_path), None, tmp_path / "work", frames=150)
+    prepared = prepare(only(made, name, tmp_path), None, tmp_path / "work", frames=150)
     assert len(prepared.photos) >= FRAMES - 1
     assert any(VIDEOS[name] in warning for warning in prepared.warnings)
-    photo = prepared.photos[22]
+    photo = prepared.photos[FRAMES // 2]
     with Image.open(photo.path) as frame:
         found = np.asarray(frame, float)
-    number = int(photo.path.stem.rpartition("_")[2])
-    eye = np.linalg.inv(cameras()[number])[:3, 3]
-    truth = picture(still_life(0), look_at(eye, np.array([0, 0, 0.25]), 384, 288, FOCAL_LENGTH), 2)
+    truth = np.load(made / "vid.npy")[int(photo.path.stem.rpartition("_")[2])]
     assert found.shape == truth.shape
     assert 10 * math.log10(255**2 / ((found - truth) ** 2).mean()) > 33.5
     spread = [float((np.max(each, 2) - np.min(each, 2)).mean()) for each in (found, truth.astype(float))]
@@ -61,11 +75,11 @@ def test_the_frames_have_the_colours_of_sdr(built: Build, name: str, tmp_path: P
 
 
 @pytest.mark.slow
-def test_the_cameras_are_those_of_the_frames(built: Build, tmp_path: Path) -> None:
+def test_the_cameras_are_those_of_the_frames(made: Path, tmp_path: Path) -> None:
     """Rotations to a quarter of a degree after one common rotation, and square pixels from others in the file."""
     options = sfm.SfmOptions(stereo=False)
     scene = sfm.reconstruct(
-        only(built, "anamorphic.mp4", tmp_path),
+        only(made, "anamorphic.mp4", tmp_path),
         None,
         tmp_path / "work",
         options,
@@ -75,7 +89,7 @@ def test_the_cameras_are_those_of_the_frames(built: Build, tmp_path: Path) -> No
     assert len(scene.views) >= FRAMES - 1
     numbers = [int(view.image.stem.rpartition("_")[2]) for view in scene.views]
     found = np.stack([view.camera.viewmat[:3, :3] for view in scene.views])
-    truth = np.stack([cameras()[number][:3, :3] for number in numbers])
+    truth = np.stack([cameras()[number].viewmat[:3, :3] for number in numbers])
     u, _, v = np.linalg.svd(np.einsum("nji,njk->ik", found, truth))
     common = u @ np.diag([1, 1, np.linalg.det(u @ v)]) @ v
     cosines = (np.einsum("nij,jk,nik->n", found, common, truth) - 1) / 2
