@@ -21,7 +21,7 @@ REDIS ?= $(shell command -v redis-server valkey-server | head -n 1)
 # Bytecode is kept, whatever the shell asks for: the tests start hundreds of processes, and each would compile its imports again.
 PYTEST := env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
-.PHONY: FORCE help install demo quick test redis fresh coverage check ruff types rules mutants wheels docs screenshots walk pictures bench soak capacity fleet load abuse fuzz serve sanitize clean
+.PHONY: FORCE help install demo quick test redis fresh coverage check ruff types rules mutants generated wheels docs screenshots walk pictures bench soak capacity fleet load abuse fuzz serve sanitize clean
 
 help: ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -71,6 +71,9 @@ mutants: $(VENV)/.installed-dev ## check the list of mutations of the kernels (`
 
 wheels: $(VENV)/.installed-dev ## build the wheels and source distributions of the three parts into dist/
 	for part in client server worker; do $(BIN)/python -m build --no-isolation --outdir dist $$part || exit 1; done
+
+generated: $(VENV)/.installed-dev ## write the committed files that follow from others, such as MAP.md and the synchronous SDK
+	$(BIN)/python -m tests.support.generated
 
 docs: $(VENV)/.installed-dev ## build the documentation into docs/build/html, with every warning as an error
 	$(BIN)/sphinx-build --fail-on-warning --keep-going --quiet docs docs/build/html

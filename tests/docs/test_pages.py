@@ -81,7 +81,7 @@ def test_the_readme_lists_its_prerequisites_and_commands() -> None:
 
 @pytest.mark.parametrize("name", ["ARCHITECTURE.md", "MAP.md"])
 def test_the_map_is_that_of_the_modules_and_of_the_import_contracts(name: str) -> None:
-    assert (ROOT / name).read_text() == COMMITTED[name](), "`make docs` writes the page; commit it."
+    assert (ROOT / name).read_text() == COMMITTED[name](), "run: make generated"
 
 
 def test_the_paths_in_the_architecture_exist() -> None:

@@ -22,4 +22,4 @@ def test_an_input_gets_its_answer(example: Example) -> None:
 
 
 def test_the_page_of_inputs_is_that_of_the_program() -> None:
-    assert (ROOT / "docs/inputs.md").read_text() == inputs.page(), "`make docs` writes the page; commit it."
+    assert (ROOT / "docs/inputs.md").read_text() == inputs.page(), "run: make generated"

@@ -1,4 +1,4 @@
-"""The text of `splatmill/sdk/arguments.py`, from the schema. `python -m tests.support.arguments` writes it."""
+"""The text of `splatmill/sdk/arguments.py`, from the schema. `make generated` writes it."""
 
 import json
 import types
@@ -44,7 +44,7 @@ def text() -> str:
     head = [
         '"""The keyword arguments of `train`, `render`, `orbit`, `mesh` and `present`, for editors and type checkers.',
         "",
-        "Generated from the schema by `python -m tests.support.arguments`.",
+        "Generated from the schema by `make generated`.",
         '"""',
         "",
         "import os",
@@ -102,7 +102,3 @@ def _one(kind: Any) -> str:
     if issubclass(kind, StrEnum):
         return f"{kind.__name__} | Literal[{', '.join(json.dumps(str(member)) for member in kind)}]"
     return str(kind.__name__)
-
-
-if __name__ == "__main__":
-    PATH.write_text(text())

@@ -1,4 +1,4 @@
-"""The synchronous SDK as it follows from the asynchronous one. `python -m tests.support.synchronous` writes it.
+"""The synchronous SDK as it follows from the asynchronous one. `make generated` writes it.
 
 A synchronous method waits for the asynchronous one of its name, on a loop of its own (`splatmill.sdk.loop`). A copy
 without `async` and `await`, as unasync writes, would be no client of the same interface: transports such as
@@ -45,7 +45,7 @@ def text(name: str) -> str:
     """The whole module with the file name `name`."""
     sources = {module: (PACKAGE / f"{module}.py").read_text() for module in SOURCES[name]}
     made = f'"""The synchronous twins of the classes in {", ".join(f"`{module}`" for module in sources)}.\n\n'
-    made += 'Generated from these by `python -m tests.support.synchronous`.\n"""\n'
+    made += 'Generated from these by `make generated`.\n"""\n'
     made += "from collections.abc import Iterator\nfrom splatmill.sdk.loop import BackgroundLoop\n"
     if name == "client.py":
         made += (
@@ -166,8 +166,3 @@ def _call(callee: str, function: Function) -> str:
 def _names(function: Function) -> list[str]:
     """The parameters of a method but self."""
     return [each.arg for each in (*function.args.args[1:], *function.args.kwonlyargs)]
-
-
-if __name__ == "__main__":
-    for generated in SOURCES:
-        (PACKAGE / generated).write_text(text(generated))

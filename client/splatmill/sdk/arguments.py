@@ -1,6 +1,6 @@
 """The keyword arguments of `train`, `render`, `orbit`, `mesh` and `present`, for editors and type checkers.
 
-Generated from the schema by `python -m tests.support.arguments`.
+Generated from the schema by `make generated`.
 """
 
 import os

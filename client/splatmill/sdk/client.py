@@ -1,6 +1,6 @@
 """The synchronous twins of the classes in `model`, `job`, `aio`.
 
-Generated from these by `python -m tests.support.synchronous`.
+Generated from these by `make generated`.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence

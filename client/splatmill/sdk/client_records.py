@@ -1,6 +1,6 @@
 """The synchronous twins of the classes in `bin`, `imports`, `keys`, `meshes`, `orbits`, `shares`, `webhooks`.
 
-Generated from these by `python -m tests.support.synchronous`.
+Generated from these by `make generated`.
 """
 
 from collections.abc import Iterable, Mapping

@@ -16,7 +16,7 @@ from tests.support import arguments
 
 
 def test_the_module_follows_from_the_schema():
-    assert arguments.PATH.read_text() == arguments.text(), "run: python -m tests.support.arguments"
+    assert arguments.PATH.read_text() == arguments.text(), "run: make generated"
 
 
 def test_every_setting_is_an_argument():

@@ -12,7 +12,7 @@ from tests.support import synchronous
 @pytest.mark.parametrize("name", synchronous.SOURCES)
 def test_the_synchronous_modules_are_those_that_the_asynchronous_ones_make(name: str):
     written = (synchronous.PACKAGE / name).read_text()
-    assert written == synchronous.text(name), "run: python -m tests.support.synchronous"
+    assert written == synchronous.text(name), "run: make generated"
 
 
 def test_what_the_package_exports_has_its_twin():
