@@ -155,32 +155,6 @@ def test_the_same_model_gives_the_same_bytes_and_nothing_is_a_model_too(tmp_path
     assert registry.read(tmp_path / "none/lod-meta.json").gaussians.count == 0
 
 
-def test_a_model_takes_the_place_of_a_larger_one_and_of_nothing_else(tmp_path: Path, levels: Levels) -> None:
-    small = _scene().select(torch.arange(300))
-    registry.write(tmp_path / "alone/lod-meta.json", small)
-    registry.write(tmp_path / "both/small.ply", small)
-    path = tmp_path / "both/lod-meta.json"
-    streamed_sog.write_levels(path, levels, chunk=2000)
-    assert (tmp_path / "both/0_1/meta.json").is_file()
-    (tmp_path / "both/0_1/notes.txt").write_text("kept")
-    index = json.loads(path.read_text())
-    index["filenames"].append("../outside/meta.json")
-    path.write_text(json.dumps(index))
-    (tmp_path / "outside").mkdir()
-    (tmp_path / "outside/meta.json").write_text("{}")
-    registry.write(path, small)
-    left = {file.relative_to(path.parent) for file in path.parent.rglob("*") if file.is_file()}
-    own = {file.relative_to(tmp_path / "alone") for file in (tmp_path / "alone").rglob("*") if file.is_file()}
-    assert left == own | {Path("small.ply"), Path("0_1/notes.txt")}
-    assert not (tmp_path / "both/1_0").exists()
-    assert (tmp_path / "outside/meta.json").is_file()
-    path.write_text('["no index"]')
-    registry.write(path, small)
-    assert (
-        registry.read(path).gaussians.count == registry.read(tmp_path / "alone/lod-meta.json").gaussians.count
-    )
-
-
 @pytest.mark.parametrize(
     ("change", "says"),
     [

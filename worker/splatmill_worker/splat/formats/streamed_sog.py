@@ -59,8 +59,7 @@ def write(path: Path, gaussians: Gaussians, *, offset: Offset = NO_OFFSET, antia
     Those of the surroundings are counted too. Rows with a non-finite parameter and rows with an opacity under
     MIN_OPACITY of the `.ply` are left out. offset, antialiased: of `Contents`.
 
-    An index that is there is removed first and the new one is written last, so that none names files of another model;
-    then the files go that only the former one named.
+    An index that is there is removed first and the new one is written last, so that none names files of another model.
     """
     gaussians = visible(gaussians)
     write_levels(path, make_levels(gaussians), offset=offset, antialiased=antialiased)
@@ -76,7 +75,6 @@ def write_levels(
     chunk: int = CHUNK,
 ) -> None:
     """Write levels as `write` does. chunk: Gaussians of a chunk at most, unless a leaf has more."""
-    former = _former(path)
     path.unlink(missing_ok=True)
     chunks = [part for number, level in enumerate(levels.levels) for part in _chunks(number, level, chunk)]
     names, places = list[str](), dict[int, int]()
@@ -90,10 +88,6 @@ def write_levels(
     if levels.surroundings is not None:
         _write_sog(path.parent / ENVIRONMENT, levels.surroundings, offset, antialiased)
     atomic_write(path, json.dumps(_index(levels, chunks, names), separators=(",", ":")), sync=True)
-    for file in former.difference(files(path)):
-        file.unlink(missing_ok=True)
-        if file.parent != path.parent and not any(file.parent.iterdir()):
-            file.parent.rmdir()
 
 
 def read(path: Path) -> Contents:
@@ -102,7 +96,9 @@ def read(path: Path) -> Contents:
     Raises ModelUnreadable for any other file, and FileNotFoundError where there is none.
     """
     try:
-        names = _finest(_document(path))
+        if path.stat().st_size > MAX_INDEX_BYTES:
+            raise ValueError(f"it has more than {MAX_INDEX_BYTES} bytes")
+        names = _finest(json.loads(path.read_bytes()))
     except FileNotFoundError:
         raise
     except (OSError, ValueError, KeyError, TypeError, IndexError, AttributeError, RecursionError) as error:
@@ -119,26 +115,9 @@ def read(path: Path) -> Contents:
 
 def files(path: Path) -> list[Path]:
     """The files of a model that `write` has written: `path`, and those of its chunks and of its environment."""
-    index = _document(path)
-    metas = [path.parent / name for name in [*index["filenames"], *_environment(index)] if _is_beside(name)]
-    return [path, *(file for meta in metas for file in _sog_files(meta))]
-
-
-def _former(path: Path) -> set[Path]:
-    """The files of the model that `path` names before it is written anew; none where it is no index."""
-    try:
-        return set(files(path))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        return set()
-
-
-def _sog_files(meta: Path) -> list[Path]:
-    """A `meta.json` and the images beside it that it names, by name; none where it is missing."""
-    if not meta.is_file():
-        return []
-    parts = [part for part in json.loads(meta.read_bytes()).values() if isinstance(part, dict)]
-    names = {meta.name, *(name for part in parts for name in part.get("files", []))}
-    return [meta.with_name(name) for name in sorted(names) if PurePosixPath(name).name == name]
+    index = json.loads(path.read_bytes())
+    names = [*index["filenames"], *([index["environment"]] if "environment" in index else [])]
+    return [path, *(file for name in names for file in sorted((path.parent / name).parent.iterdir()))]
 
 
 def _chunks(number: int, level: Level, most: int) -> Iterator[Chunk]:
@@ -218,23 +197,6 @@ def _short(number: float) -> float:
     return float(f"{number:.7g}")
 
 
-def _document(path: Path) -> Any:
-    """The JSON of an index. Raises ValueError where it is none or has more than MAX_INDEX_BYTES."""
-    if path.stat().st_size > MAX_INDEX_BYTES:
-        raise ValueError(f"it has more than {MAX_INDEX_BYTES} bytes")
-    return json.loads(path.read_bytes())
-
-
-def _environment(index: Any) -> list[str]:
-    return [index["environment"]] if index.get("environment") else []
-
-
-def _is_beside(name: str) -> bool:
-    """Whether this is the path of a `meta.json` in a folder beside the index, and not elsewhere."""
-    place = PurePosixPath(name)
-    return not place.is_absolute() and ".." not in place.parts and place.name == "meta.json"
-
-
 def _finest(index: Any) -> list[str]:
     """The SOG of level 0 and of the environment. Raises ValueError, KeyError or TypeError for another document."""
     if index["version"] != VERSION:
@@ -247,10 +209,11 @@ def _finest(index: Any) -> list[str]:
         if "0" in node.get("lods", {}):
             found[node["lods"]["0"]["file"]] = None
     names = [*dict.fromkeys(index["filenames"][file] for file in found)]
-    names += _environment(index)
+    names += [index["environment"]] if index.get("environment") else []
     if not names:
         raise ValueError("its tree has no leaf with level 0")
     for name in names:
-        if not _is_beside(name):
+        place = PurePosixPath(name)
+        if place.is_absolute() or ".." in place.parts or place.name != "meta.json":
             raise ValueError(f"it names {name[:80]!r}, which is no meta.json in a folder beside it")
     return names
