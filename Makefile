@@ -72,8 +72,8 @@ mutants: $(VENV)/.installed-dev ## check the list of mutations of the kernels (`
 wheels: $(VENV)/.installed-dev ## build the wheels and source distributions of the three parts into dist/
 	for part in client server worker; do $(BIN)/python -m build --no-isolation --outdir dist $$part || exit 1; done
 
-generated: $(VENV)/.installed-dev ## write the committed files that follow from others, such as MAP.md and the synchronous SDK
-	$(BIN)/python -m tests.support.generated
+generated: $(VENV)/.installed-dev ## write the committed files that are made from the source code, such as MAP.md and the synchronous SDK
+	$(BIN)/python -m docs.generate.committed
 
 docs: $(VENV)/.installed-dev ## build the documentation into docs/build/html, with every warning as an error
 	$(BIN)/sphinx-build --fail-on-warning --keep-going --quiet docs docs/build/html

@@ -20,13 +20,13 @@ PARTS = {
 
 INTRODUCTION = """# The modules
 
-What each module is for, as its own first sentence says, and its public functions and classes; made by `make docs` from
-the program.
+What each module is for, as its own first sentence says, and its public functions and classes; made by `make generated`
+from the program.
 [ARCHITECTURE.md](ARCHITECTURE.md) has the rooms on one page, and how they work together. Rooms of server and worker are
 in the order of their floors, from the top; other modules in that of the alphabet.
 """
 
-_BLOCK = re.compile(r"(<!-- made by `make docs` from the program: (\w+) -->\n).*?(<!-- end -->)", re.S)
+_BLOCK = re.compile(r"(<!-- made by `make generated` from the program: (\w+) -->\n).*?(<!-- end -->)", re.S)
 
 
 def modules() -> str:

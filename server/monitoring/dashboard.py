@@ -1,17 +1,14 @@
-"""Writes `dashboard.json`, the Grafana dashboard of the service: `python server/monitoring/dashboard.py`.
+"""The text of `dashboard.json`, the Grafana dashboard of the service. `make generated` writes it.
 
 It is built from Grafana's own types, so that mypy checks its fields. A metric that all API processes tell alike is
 aggregated by `max`, one that each counts for itself by `sum` (docs/generate/metrics.py lists which is which).
 """
 
 import json
-from pathlib import Path
 
 from grafana_foundation_sdk.builders import common, dashboard, prometheus, stat, timeseries
 from grafana_foundation_sdk.cog.encoder import JSONEncoder
 from grafana_foundation_sdk.models.common import DataSourceRef
-
-PATH = Path(__file__).with_name("dashboard.json")
 
 _SOURCE = DataSourceRef(type_val="prometheus", uid="${source}")
 _HEIGHT, _WIDTH = 8, 8
@@ -287,7 +284,3 @@ def text() -> str:
     for number, panel in enumerate(built.panels or [], start=1):
         panel.id_val = number
     return json.dumps(json.loads(JSONEncoder().encode(built)), indent=1, sort_keys=True) + "\n"
-
-
-if __name__ == "__main__":
-    PATH.write_text(text())

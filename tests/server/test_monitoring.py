@@ -99,9 +99,7 @@ def test_the_dashboard_is_what_grafanas_types_make_of_it() -> None:
     assert len({panel["id"] for panel in DASHBOARD["panels"]}) == len(DASHBOARD["panels"])
     program: dict[str, Any] = {"__file__": str(MONITORING / "dashboard.py"), "__name__": "dashboard"}
     exec(compile((MONITORING / "dashboard.py").read_text(), "dashboard.py", "exec"), program)
-    assert program["text"]() == (MONITORING / "dashboard.json").read_text(), (
-        "run server/monitoring/dashboard.py"
-    )
+    assert program["text"]() == (MONITORING / "dashboard.json").read_text(), "run: make generated"
 
 
 def test_every_alert_is_played_until_it_fires() -> None:

@@ -163,7 +163,7 @@ def avif_tags(path: Path) -> tuple[int, int]:
 
     They are 2, unspecified, where FFmpeg cannot read the file.
     """
-    import av  # FFmpeg takes a quarter of the start of a decoding process, which most photos do not need
+    import av  # a quarter of the start of a decoding process; only videos and AVIF need it
 
     options = {
         "protocol_whitelist": "file",

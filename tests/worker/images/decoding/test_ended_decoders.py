@@ -466,7 +466,7 @@ ANSWERS = (
 
 @pytest.mark.slow
 def test_an_answer_that_is_none_costs_the_file(photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """And no other file: the next one is read by another process."""
+    """Each of them costs its own file alone: another process reads the next one."""
     known = acts(monkeypatch)
 
     def refused(answer: bytes) -> bool:

@@ -78,7 +78,7 @@ def test_a_point_at_the_end_of_the_world_changes_nothing() -> None:
 
 
 def test_a_scan_of_a_part_of_the_scene_is_brought_back() -> None:
-    points, colors = scanned()
+    points, colors = synthetic.scan(240, 180)
     near = np.linalg.norm(points - np.array([0.0, 0.0, 0.4]), axis=1)
     part = near < np.quantile(near, 0.15)
     truth = moved(5, 7.0)
@@ -91,9 +91,9 @@ def test_a_scan_of_a_part_of_the_scene_is_brought_back() -> None:
 
 
 def test_a_scan_of_a_house_around_the_scene_is_brought_back() -> None:
-    points, colors = scanned()
+    points, colors = synthetic.scan(240, 180)
     random = np.random.default_rng(0)
-    walls = random.uniform(-8.0, 8.0, (5_000, 3))
+    walls = random.uniform(-8.0, 8.0, (20_000, 3))
     axis = random.integers(0, 3, len(walls))
     walls[np.arange(len(walls)), axis] = np.where(random.random(len(walls)) < 0.5, -8.0, 8.0)
     paint = random.integers(0, 255, (300, 3))

@@ -31,7 +31,8 @@ pytestmark = pytest.mark.slow
 WIDTH, HEIGHT, COUNT = 320, 240, 14
 
 FEWER = 8
-"""Photos of a half of the orbit, which are enough to tell whether there are points."""
+"""Photos of a little more than half of the orbit, which are enough to know whether there are points, and whether the
+cameras are right."""
 
 Truth = dict[str, Camera]
 

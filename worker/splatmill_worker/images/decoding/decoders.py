@@ -108,8 +108,8 @@ def confined(
     read: the files and folders that they may open.
     ended: a file with the list of files that have ended their process twice, which the next attempt does not open.
     cancelled: whether the reader of a model (`call_once`), which takes minutes for some, is to end.
-    keep_reader: let one process answer all of `call_once`, as programs wish that read thousands of models; it takes
-        the memory of its libraries until the block ends.
+    keep_reader: let one process answer all of `call_once`, one at a time, within what was free at the first of them.
+        For benchmarks and tests that read thousands of models: the start of a process takes seconds.
     """
     global _active
     decoders = Decoders(read, ended, cancelled=cancelled, keep_reader=keep_reader)
@@ -154,7 +154,8 @@ def call_once(
     check: Callable[[Any], T],
     fault: Fault,
 ) -> T:
-    """Like `call`, in a process that ends with the call, since the libraries that read models are large.
+    """Like `call`, in a process that ends with the call, since the libraries that read models are large
+    (unless `confined` keeps it).
 
     It may take all the memory that is free (`reader_memory.limit`). Its answer may take a part of that, which this
     process allocates as soon as the length is announced. Raises Cancelled as well, within a fraction of a second.

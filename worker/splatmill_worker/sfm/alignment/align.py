@@ -18,7 +18,8 @@ SCENE_POINTS = 3_000
 """Points of the scene that are compared."""
 
 FIRST_POINTS = 1_000
-"""Points of the scene that a guess is first refined with: most guesses are wrong, and are left after that."""
+"""Points of the scene that a first guess is refined with. Most guesses are wrong, and have a low score after it
+(decisions: FIRST_POINTS)."""
 
 SPARSE, DENSE = (4_000, 20_000), 100_000
 """Points of the scan that the first guess is searched with, in turns: of a scan that has much more than the scene, many
