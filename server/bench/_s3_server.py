@@ -56,7 +56,7 @@ def _create(url: str) -> None:
     end = time.monotonic() + _START_SECONDS
     while True:
         try:
-            httpx.put(url, trust_env=False).raise_for_status()
+            httpx.put(url, trust_env=False, timeout=60).raise_for_status()
             return
         except httpx.HTTPError as error:
             if time.monotonic() > end:

@@ -78,7 +78,9 @@ def measure(options: argparse.Namespace) -> Iterator[Row]:
         tempfile.TemporaryDirectory(prefix="splatmill-abuse-") as name,
         serving(photos[piecewise]) as host,
         served(Path(name), settings) as (url, _),
-        httpx.Client(base_url=url, headers={"Authorization": f"Bearer {key}"}, trust_env=False) as admin,
+        httpx.Client(
+            base_url=url, headers={"Authorization": f"Bearer {key}"}, trust_env=False, timeout=60
+        ) as admin,
     ):
         trainer = Trainer(url, _key(admin, "trains", None), photos, piecewise, host)
         abuses = {"read_key": _key(admin, "trains", None, "read")}

@@ -54,7 +54,7 @@ def test_other_devices_need_https_the_certificate_and_the_key(up: Up, address: s
     assert (base.scheme, base.host) == ("https", address)
     trusting = ssl.create_default_context(cafile=up.data / "lan" / "certificate.pem")
     for host in (address, "127.0.0.1", "localhost"):
-        with httpx.Client(base_url=f"https://{host}:{base.port}", verify=trusting) as http:
+        with httpx.Client(base_url=f"https://{host}:{base.port}", verify=trusting, timeout=60) as http:
             assert http.get("/v1/jobs").status_code == 401
             told = http.get("/v1/info", headers={"Authorization": f"Bearer {key_of(up)}"}).json()["lan"]
     assert told == {
@@ -62,9 +62,9 @@ def test_other_devices_need_https_the_certificate_and_the_key(up: Up, address: s
         "fingerprint": fingerprint(up.data / "lan" / "certificate.pem"),
     }
     with pytest.raises(httpx.ConnectError, match=r"self.signed"):
-        httpx.get(f"{base}/v1/info")
+        httpx.get(f"{base}/v1/info", timeout=60)
     with pytest.raises(httpx.HTTPError):
-        httpx.get(f"http://{address}:{base.port}/v1/info")
+        httpx.get(f"http://{address}:{base.port}/v1/info", timeout=60)
     for name in ("key", "certificate.key"):
         assert (up.data / "lan" / name).stat().st_mode & 0o077 == 0
 

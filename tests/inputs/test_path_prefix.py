@@ -57,7 +57,7 @@ def test_what_the_page_loads_is_found_below_the_path(tmp_path: Path) -> None:
     with empty_redis(tmp_path) as url:
         settings = Settings(redis_url=url, data=tmp_path / "data", reaper_interval=3600, root_path="/splats")
         with served_app(settings, connect(url)) as app, proxy(app.address[1]) as address:
-            page = httpx.get(address, follow_redirects=True)
+            page = httpx.get(address, follow_redirects=True, timeout=60)
             assert page.status_code == 200
             named = set(re.findall(r'(?:src|href)="([^"#]+)"', page.text))
             loaded = {urljoin(str(page.url), each) for each in named if not each.startswith("data:")}
@@ -65,5 +65,5 @@ def test_what_the_page_loads_is_found_below_the_path(tmp_path: Path) -> None:
             assert {each.rpartition(".")[2] for each in own} >= {"js", "css"}
             for each in own:
                 assert each.startswith(address), each
-                assert httpx.get(each, follow_redirects=True).status_code == 200, each
-            assert httpx.get(urljoin(address, "v1/info")).json()["accepted"]["photos"]
+                assert httpx.get(each, follow_redirects=True, timeout=60).status_code == 200, each
+            assert httpx.get(urljoin(address, "v1/info"), timeout=60).json()["accepted"]["photos"]

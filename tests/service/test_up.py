@@ -196,7 +196,7 @@ def test_what_an_operator_sees(tmp_path: Path) -> None:
     assert process.stderr is not None
     line = process.stderr.readline()
     assert line == f"Splatmill is ready at http://127.0.0.1:{port}\n"
-    assert httpx.get(f"http://127.0.0.1:{port}/readyz").status_code == 200
+    assert httpx.get(f"http://127.0.0.1:{port}/readyz", timeout=60).status_code == 200
     process.send_signal(signal.SIGTERM)
     process.stderr.read()
     process.stderr.close()

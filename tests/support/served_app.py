@@ -96,7 +96,7 @@ def served_app(settings: Settings, connection: redis.Redis) -> Iterator[ServedAp
     try:
         base = f"http://{address[0]}:{address[1]}"
         # Without TLS no certificates are needed, and to load them takes longer than some tests.
-        with httpx.Client(base_url=base, headers=headers, timeout=20, trust_env=False, verify=False) as http:
+        with httpx.Client(base_url=base, headers=headers, timeout=60, trust_env=False, verify=False) as http:
             yield ServedApp(http, app.state.service, address, settings, connection, app)
     finally:
         app.state.service.closing.set()

@@ -36,7 +36,7 @@ class Up:
             self.environment.pop(name, None)
         self.environment |= environment or {}
         self.process: subprocess.Popen[str] | None = None
-        self.http = httpx.Client(verify=False)  # without TLS no certificates are needed
+        self.http = httpx.Client(verify=False, timeout=60)  # without TLS no certificates are needed
 
     def start(self, *options: str, largest_file: int | None = None, renders: bool = True) -> "Up":
         """Start and wait until it is ready.

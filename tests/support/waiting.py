@@ -13,7 +13,7 @@ SHORTEST_PAUSE, LONGEST_PAUSE = 0.01, 0.25
 a tenth of the time that was waited already."""
 
 
-def wait_for(condition: Callable[[], Value | Literal[False] | None], seconds: float = 60.0) -> Value:
+def wait_for(condition: Callable[[], Value | Literal[False] | None], seconds: float = 120.0) -> Value:
     """Return the first true value of `condition`. Fails the test when there is none within `seconds`."""
     began = time.monotonic()
     while True:

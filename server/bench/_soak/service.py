@@ -297,7 +297,9 @@ class Service:
         port = self._ports[1]
         self._s3 = self._popen(_s3_server.command(port), "s3", dict(os.environ))
         url = f"http://127.0.0.1:{port}/soak"
-        self.wait_for(lambda: _answers(lambda: httpx.put(url, trust_env=False)), 60, "the S3 server answers")
+        self.wait_for(
+            lambda: _answers(lambda: httpx.put(url, trust_env=False, timeout=60)), 60, "the S3 server answers"
+        )
         self.s3_proxy = Proxy(("127.0.0.1", port))
         self.storage_url = "s3://soak/data"
         self.environment |= _s3_server.environment(self.s3_proxy.port) | {

@@ -44,12 +44,12 @@ def test_links_are_made_and_revoked_on_the_page(service: Up, model: SmallModel, 
     page.keyboard.press("Enter")
     link = dialog.get_by_label("The link").input_value()
     assert f'<iframe src="{link}/embed" ' in dialog.get_by_label("HTML of a frame").input_value()
-    bare = httpx.get(f"{link}/model").json()
+    bare = httpx.get(f"{link}/model", timeout=60).json()
     assert bare["id"] == model.id
     dialog.get_by_label("Show photos too").check()
     dialog.get_by_role("button", name="Make a link").click()
     expect(dialog.get_by_role("listitem").filter(has_text="with photos")).to_have_count(1)
-    whole = httpx.get(f"{dialog.get_by_label('The link').input_value()}/model").json()
+    whole = httpx.get(f"{dialog.get_by_label('The link').input_value()}/model", timeout=60).json()
     photos = {file["name"] for file in whole["files"]} - {file["name"] for file in bare["files"]}
     assert photos == {"held_out/000.webp", "held_out/001.webp", "report.html"}
     reach = dialog.get_by_text("Only this machine reaches 127.0.0.1")
@@ -72,7 +72,7 @@ def test_links_are_made_and_revoked_on_the_page(service: Up, model: SmallModel, 
     expect(dialog.get_by_label("The link")).to_be_visible()  # that is another one
     dialog.get_by_role("listitem").filter(has_text="with photos").get_by_role("button").click()
     expect(dialog.get_by_label("The link")).to_have_count(0)
-    assert httpx.get(f"{link}/model").status_code == 410
+    assert httpx.get(f"{link}/model", timeout=60).status_code == 410
     page.keyboard.press("Escape")
     expect(dialog).to_be_hidden()
     page.goto(f"/models/{model.id}")

@@ -30,13 +30,13 @@ def test_the_life_of_a_link(url):
         made = shares.create(expires_in="2h", name="for mum")
         assert (made.model, made.name, made.active) == (MODEL, "for mum", True)
         assert (made.expires_at - made.created_at).total_seconds() == 7200
-        assert httpx.get(f"{url.rstrip('/')}{made.path}/model").json()["id"] == MODEL
+        assert httpx.get(f"{url.rstrip('/')}{made.path}/model", timeout=60).json()["id"] == MODEL
         assert [found.id for found in shares.list()] == [made.id]
         shares.revoke(made.id)
         [ended] = shares.list()
         assert ended.revoked_at is not None
         assert not ended.active
-        assert httpx.get(f"{url.rstrip('/')}{made.path}/model").status_code == 410
+        assert httpx.get(f"{url.rstrip('/')}{made.path}/model", timeout=60).status_code == 410
         with pytest.raises(NotFound, match="has no link"):
             shares.revoke("00000000")
         with pytest.raises(InvalidRequest, match="expires_in"):
@@ -64,11 +64,11 @@ def test_the_command_prints_the_whole_address(url):
     printed = invoke("create", MODEL, "--expires-in", "90s", "--name", "for mum").stdout.splitlines()
     address = printed[-1]
     assert address.startswith(f"{url.rstrip('/')}/s/{MODEL}-")
-    assert httpx.get(f"{address}/model").status_code == 200
+    assert httpx.get(f"{address}/model", timeout=60).status_code == 200
     listed = json.loads(invoke("list", MODEL, "--json").stdout)
     assert listed["name"] == "for mum"
     assert "for mum" in invoke("list", MODEL).stdout
     assert "valid until" in invoke("list", MODEL).stdout
     assert "is revoked" in invoke("revoke", MODEL, listed["id"]).stdout
     assert "revoked" in invoke("list", MODEL).stdout
-    assert httpx.get(f"{address}/model").status_code == 410
+    assert httpx.get(f"{address}/model", timeout=60).status_code == 410

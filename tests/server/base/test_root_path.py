@@ -168,10 +168,12 @@ def test_a_page_finds_its_files_below_any_path(serve: Serve, settings: dict[str,
 def test_a_path_named_by_a_stranger_is_not_believed(serve: Serve) -> None:
     app = serve(forwarded_allow_ips="192.0.2.1")
     with path_proxy(app.address[1], strip=True, sent={HEADER: "/splats"}) as base:
-        assert httpx.post(f"{base}/v1/captures").headers["location"].startswith("/v1/captures/")
+        assert httpx.post(f"{base}/v1/captures", timeout=60).headers["location"].startswith("/v1/captures/")
     configured = serve(root_path="/own")
     with path_proxy(configured.address[1], "/own", strip=True, sent={HEADER: "/evil"}) as base:
-        assert httpx.post(f"{base}/v1/captures").headers["location"].startswith("/own/v1/captures/")
+        assert (
+            httpx.post(f"{base}/v1/captures", timeout=60).headers["location"].startswith("/own/v1/captures/")
+        )
 
 
 @pytest.mark.parametrize(
@@ -204,9 +206,11 @@ def test_the_servers_own_paths_are_known(app: ServedApp) -> None:
 def test_what_a_key_is_asked_for_does_not_depend_on_the_path(serve: Serve) -> None:
     app = serve(api_key="s3cret", root_path="/splats")
     for address in ("/splats/v1/jobs", "/v1/jobs", "/splats/splats/", "/splatsv1/jobs", "/splats//v1/jobs"):
-        assert httpx.get(f"http://127.0.0.1:{app.address[1]}{address}").status_code == 401, address
+        assert httpx.get(f"http://127.0.0.1:{app.address[1]}{address}", timeout=60).status_code == 401, (
+            address
+        )
     for address in ("/splats", "/splats/", "/", "/splats/jobs", "/splats/healthz"):
-        answer = httpx.get(f"http://127.0.0.1:{app.address[1]}{address}", follow_redirects=True)
+        answer = httpx.get(f"http://127.0.0.1:{app.address[1]}{address}", follow_redirects=True, timeout=60)
         assert answer.status_code == 200, address
     # The size of a body is limited, but for files.
     large = b"0" * (app.settings.max_json_bytes + 1)
@@ -235,9 +239,9 @@ def test_a_page_may_write_where_the_proxy_has_replaced_the_host(app: ServedApp) 
     with path_proxy(app.address[1], strip=True, host=False) as base:
         origin = base.removesuffix("/splats")
         sent = {"Origin": origin, "Sec-Fetch-Site": "same-origin"}
-        assert httpx.post(f"{base}/v1/captures", headers=sent).status_code == 201
+        assert httpx.post(f"{base}/v1/captures", headers=sent, timeout=60).status_code == 201
         for site in ("same-site", "cross-site"):
-            answer = httpx.post(f"{base}/v1/captures", headers=sent | {"Sec-Fetch-Site": site})
+            answer = httpx.post(f"{base}/v1/captures", headers=sent | {"Sec-Fetch-Site": site}, timeout=60)
             problem(answer, 403, "origin_not_allowed")
 
 

@@ -74,7 +74,7 @@ def test_a_link_gives_out_nothing_about_the_machine(serve: Serve, tmp_path: Path
         for photos in (False, True)
     ]
     link = links[-1]
-    with httpx.Client(base_url=app.http.base_url) as stranger:
+    with httpx.Client(base_url=app.http.base_url, timeout=60) as stranger:
         base = f"{link}/model"
         shown = stranger.get(base).raise_for_status()
         names = [file["name"] for file in shown.json()["files"]]

@@ -35,7 +35,7 @@ def app(serve: Serve) -> ServedApp:
 @pytest.fixture
 def stranger(app: ServedApp) -> Any:
     """Somebody without a key."""
-    with httpx.Client(base_url=app.http.base_url) as http:
+    with httpx.Client(base_url=app.http.base_url, timeout=60) as http:
         yield http
 
 

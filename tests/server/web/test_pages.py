@@ -34,7 +34,7 @@ PAGES = (
 @pytest.mark.parametrize("path", PAGES)
 def test_pages_need_no_key_and_their_files_are_there(serve: Serve, path: str) -> None:
     app = serve(api_key="s3cret")
-    with httpx.Client(base_url=app.http.base_url, verify=False) as stranger:
+    with httpx.Client(base_url=app.http.base_url, verify=False, timeout=60) as stranger:
         answer = stranger.get(path)
         assert answer.status_code == 200
         assert answer.headers["content-type"] == "text/html; charset=utf-8"
@@ -51,7 +51,7 @@ def test_pages_need_no_key_and_their_files_are_there(serve: Serve, path: str) ->
 def test_what_is_below_v1_still_needs_a_key(serve: Serve) -> None:
     app = serve(api_key="s3cret")
     for path in ("/v1/models", "/metrics", "/jobs/a/b", "/page"):
-        answer = httpx.get(f"{app.http.base_url}".rstrip("/") + path, verify=False)
+        answer = httpx.get(f"{app.http.base_url}".rstrip("/") + path, verify=False, timeout=60)
         assert answer.status_code == 401, path
 
 
@@ -177,7 +177,7 @@ def test_people_see_a_page_at_an_unknown_address_and_programs_a_problem(serve: S
     assert (page.status_code, page.headers["content-type"]) == (404, "text/html; charset=utf-8")
     problem(keyless.http.get("/nothing/here"), 404, "not_found")
     problem(keyless.http.get("/v1/nothing", headers=browser), 404, "not_found")
-    with httpx.Client(base_url=keyed.http.base_url) as stranger:
+    with httpx.Client(base_url=keyed.http.base_url, timeout=60) as stranger:
         led = stranger.get("/nothing/here", headers=browser)
         assert (led.status_code, led.headers["location"]) == (303, "/sign-in?next=/nothing/here")
         problem(stranger.get("/v1/models", headers=browser), 401, "unauthorized")

@@ -20,7 +20,7 @@ def bucket() -> Iterator[str]:
         patch.setenv("AWS_ACCESS_KEY_ID", "test")
         patch.setenv("AWS_SECRET_ACCESS_KEY", "test")
         patch.setenv("AWS_REGION", "us-east-1")
-        assert httpx.put(f"{url}/captures-test", trust_env=False).status_code == 200
+        assert httpx.put(f"{url}/captures-test", trust_env=False, timeout=60).status_code == 200
         try:
             yield "s3://captures-test/data"
         finally:
