@@ -14,10 +14,12 @@ from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import pytest
+import redis
 
 from splatmill import verify_webhook
 from splatmill.backplane import keys
 from splatmill.backplane.jobs import row
+from splatmill.backplane.jobs.row import JobRow
 from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.storage import StorageFullError
 from splatmill.schema import Job, JobState, Problem, StateEvent
@@ -365,6 +367,30 @@ def test_the_end_of_a_job_that_redis_lost_is_told_once_it_is_restored(
     assert [verified(made, seen)["data"]["id"] for seen in peer.seen] == [finished]
     assert verified(made, peer.seen[0])["type"] == "job.succeeded"
     assert row.read(app.redis, kept) is not None
+
+
+def test_the_end_of_a_job_that_is_restored_while_it_is_retired_is_told(
+    app: ServedApp, peer: ScriptedServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever retires it first finds no row, and then the restored one."""
+    made = webhook(app, peer)
+    job = app.job()
+    app.begin(job)
+    jobs, read = app.service.jobs, row.read
+    retire, found = jobs.retire, itertools.count()
+
+    def lost_at_first(connection: redis.Redis, job_id: str) -> JobRow | None:
+        return None if job_id == job and next(found) == 0 else read(connection, job_id)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(jobs, "retire", lambda job_id: None)  # the process that follows ends comes too late
+        app.finish(job)
+        wait_for(lambda: app.redis.llen(keys.ENDS) == 0)
+        patch.setattr(row, "read", lost_at_first)
+        retire(job)
+    app.service.reaper.tick()
+    over(app, made, 1)
+    assert verified(made, peer.seen[0])["data"]["id"] == job
 
 
 def test_old_deliveries_are_deleted_and_unreadable_records_harm_no_other(

@@ -241,9 +241,10 @@ class Jobs:
     def retire(self, job_id: str) -> None:
         """Store the log of a job that has ended, announce its end, and remove it from the set of active ones.
 
-        The job stays active if its log or its end cannot be stored, which is then tried again, or if it was restarted
-        meanwhile. The request of a job whose row is lost is kept.
+        The job stays active if its log or its end cannot be stored, which is then tried again, or if it was restarted,
+        or restored from storage, meanwhile. The request of a job whose row is lost is kept.
         """
+        announced: int | None = None
         try:
             if (known := row.read(self.connection, job_id)) is not None and (
                 job := self._job(known)
@@ -257,6 +258,7 @@ class Jobs:
                     # Its worker was killed between the model and the list.
                     lists.add_model(self.connection, job_id, job.finished_at or job.created_at, known.owner)
                 self._announce_end(known)
+                announced = known.generation
         except StorageError as error:
             log.warning("the end of a job cannot be stored", job=job_id, error=str(error))
             return
@@ -268,14 +270,15 @@ class Jobs:
             known = row.read(self.connection, job_id)
             states = events.read_states(self.connection, job_id)
             state = fold(known, states).state if known else None
-            retired = known if state is not None and state.final else None
+            told = known is not None and known.generation == announced
+            retired = known if told and state is not None and state.final else None
             pipe.multi()
             if known is None:
                 pipe.srem(keys.ACTIVE, job_id)
-            elif state is not None and state.final:
-                outcome.retire(pipe, known, states)
-                created = lists.milliseconds(known.created_at)
-                lists.put_job(pipe, job_id, created, known.owner, known.capture, state.value)
+            elif retired is not None and state is not None:
+                outcome.retire(pipe, retired, states)
+                created = lists.milliseconds(retired.created_at)
+                lists.put_job(pipe, job_id, created, retired.owner, retired.capture, state.value)
                 shrinking.note(pipe, job_id, moment)
 
         self.connection.transaction(remove, keys.job(job_id), keys.states(job_id))
