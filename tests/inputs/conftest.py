@@ -47,7 +47,12 @@ class Trained:
 
 
 def run_script(base: Path, *command: str) -> None:
-    """Run a script of the inputs, with the folder of the photos and cameras that all of them are made from."""
+    """Run a script of the inputs, with the folder of the photos and cameras that all of them are made from.
+
+    Skips the test where the shared inputs are not on this machine.
+    """
+    if not INPUTS.is_dir():
+        pytest.skip("the shared inputs are not on this machine")
     environment = {**os.environ, "PYTHONPATH": str(INPUTS), "SPLATMILL_REPRO_BASE": str(base)}
     subprocess.run([sys.executable, *command], env=environment, cwd=ROOT, check=True, timeout=600)
 
@@ -55,8 +60,6 @@ def run_script(base: Path, *command: str) -> None:
 @pytest.fixture(scope="session")
 def built(tmp_path_factory: pytest.TempPathFactory) -> Build:
     """A function (name, *kind) that builds an input once in a run of the tests. Its folder must not be changed."""
-    if not INPUTS.is_dir():
-        pytest.skip("the shared inputs are not on this machine")
 
     def build(name: str, *kind: str) -> Path:
         base = made_once(
