@@ -95,6 +95,7 @@ class RenderApp:
         self._cache = ModelCache(storage, cache_bytes, backend)
         self._meshes = MeshMaker(storage, backend)
         self._queue = RenderQueue(MAX_WAITING, MAX_OF_CLIENT, MAX_OF_OWNER, RESERVED)
+        self._conversions = RenderQueue(MAX_WAITING)  # beside the pictures: a million Gaussians take a minute
 
     def asgi(self) -> Starlette:
         """Return the ASGI application."""
@@ -280,7 +281,7 @@ class RenderApp:
     async def _converted(
         self, request: Request, model_id: str, body: ConversionRequest, headers: dict[str, str]
     ) -> Response:
-        """Convert, then compare picture by picture, so that images can be rendered in between."""
+        """Convert beside what is rendered, and compare picture by picture, so that others come in between."""
         from splatmill_worker.render_service import conversion
 
         form = DOWNLOADS.get(body.format)
@@ -290,7 +291,7 @@ class RenderApp:
             lambda: self._cache.get(model_id), request.is_disconnected, _client(request)
         )
         folder = scratch(request)
-        path, back, record = await self._queue.run(
+        path, back, record = await self._conversions.run(
             partial(conversion.convert, model, form, folder, self._storage),
             request.is_disconnected,
             _client(request),

@@ -110,6 +110,15 @@ MODEL_FORMATS: dict[str, ModelFormat] = {
             folder=True,
         ),
         ModelFormat(
+            ".lod.zip",
+            "Streamed SOG, version 1, in a .zip: levels of detail that the page loads in parts",
+            "application/zip",
+            readable=True,
+            writable=True,
+            loses="What .sog loses, in the finest level.",
+            readers=("unpacked, SuperSplat", "PlayCanvas", "Babylon.js", "splat-transform"),
+        ),
+        ModelFormat(
             ".glb",
             "binary glTF with KHR_gaussian_splatting",
             "model/gltf-binary",
@@ -124,9 +133,12 @@ MODEL_FORMATS: dict[str, ModelFormat] = {
 
 
 def is_model_file(name: str) -> bool:
-    """Whether a name is that of a file from which a model can be read: of one that a training may start from."""
-    model_format = format_of(name)
-    return model_format is not None and model_format.readable and model_format.suffix.startswith(".")
+    """Whether a name is that of a file that a training may start from: of a model that can be read, in one file.
+
+    A .zip is none: of those, what is uploaded is unpacked.
+    """
+    form = format_of(name)
+    return form is not None and form.readable and form.suffix[0] == "." and not form.suffix.endswith(".zip")
 
 
 POINT_FORMATS: dict[str, str] = {

@@ -2,7 +2,7 @@
 
 import { get } from "./api.js";
 import { POSTER, PREVIEW, pictureOf } from "./picture.js";
-import { SMALL_FORMAT, makeSmallFile, smallFile } from "./viewer/small_file.js";
+import { makeSmallFile, smallFile, smallFormat, wholeFile } from "./viewer/small_file.js";
 import { open } from "./viewer.js";
 
 /** Bytes of a model.ply that is loaded as it is: a smaller file of it would hardly be seen sooner. */
@@ -15,12 +15,13 @@ const SOON = 1000;
  * @param {HTMLElement} box
  * @param {object} model
  * @param {string} model.address that of the model, as /v1/models/ID
+ * @param {number} model.gaussians how many it has
  * @param {{name: string}[]} model.files
  * @param {any[]} model.cameras those of the photos
  * @param {import("./viewer/presented.js").Presentation} model.presentation how its owner wants it to be shown
  * @param {import("./viewer.js").Options} options others than those for the source and the cameras
  */
-export function openModel(box, { address, files, cameras, presentation }, options) {
+export function openModel(box, { address, gaussians, files, cameras, presentation }, options) {
   // The worker takes the picture from where the first held-out photo was taken, or else the first photo of all.
   const first = (cameras.find(({ split }) => split === "test") ?? cameras[0])?.camera;
   const picture = pictureOf(files);
@@ -34,30 +35,32 @@ export function openModel(box, { address, files, cameras, presentation }, option
     cameras: cameras.map(({ camera }) => camera),
     camera,
     poster,
-    find: (say, begun) => smallest(address, say, begun),
+    whole: { ...wholeFile(address), what: "the whole model, on which a selection is shown" },
+    find: (say, begun) => smallest(address, gaussians, say, begun),
   });
 }
 
 /**
  * The file of a model to load. Where the server still has to make the smallest one, it is waited for, but no longer than
  * model.ply would take to load: so the scene is there in at most twice the time of the better choice.
- * @param {string} address @param {(text: string) => void} say
+ * @param {string} address @param {number} gaussians @param {(text: string) => void} say
  * @param {Promise<unknown>} begun settles once the viewer's engine and the picture are loaded, which shows how fast files come
  * @returns {Promise<import("./viewer/source.js").Source>}
  */
-async function smallest(address, say, begun) {
+async function smallest(address, gaussians, say, begun) {
   const whole = { url: `${address}/files/model.ply` };
+  const small = smallFile(address, gaussians);
   /** @type {any[]} */
   const formats = (await get(`${address}/formats`)).formats;
   const size = (/** @type {string} */ wanted) => formats.find(({ format }) => format === wanted)?.bytes ?? null;
   if (size("ply") <= SMALL) return whole;
-  if (size(SMALL_FORMAT) !== null) return { url: smallFile(address) };
-  const made = makeSmallFile(address);
+  if (size(smallFormat(gaussians)) !== null) return small;
+  const made = makeSmallFile(address, gaussians);
   await begun;
   const patience = size("ply") / speed();
   if (patience > SOON) say("The server makes a small file of the model, once for all visitors.");
   return Promise.race([
-    made.then((is) => is ? { url: smallFile(address) } : { ...whole, what: "the whole model, since the server could not make a small file of it" }),
+    made.then((is) => is ? small : { ...whole, what: "the whole model, since the server could not make a small file of it" }),
     new Promise((resolve) => setTimeout(resolve, patience)).then(() => whole), // what is made is for the next visit
   ]);
 }

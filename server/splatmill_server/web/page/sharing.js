@@ -5,7 +5,7 @@ import { get, send } from "./api.js";
 import { h } from "./dom.js";
 import { moment, nameOf } from "./format.js";
 import { noticeOf } from "./shell.js";
-import { makeSmallFile } from "./viewer/small_file.js";
+import { prepareSmallFile } from "./viewer/small_file.js";
 
 const TERMS = [["1d", "1 day"], ["7d", "7 days"], ["30d", "30 days"], ["365d", "1 year"]];
 
@@ -67,7 +67,7 @@ export async function openSharing(address, name) {
     event.preventDefault();
     void tried(async () => {
       const share = await send("POST", `${address}/shares`, { expires_in: term.value, name: label.value.trim() || null, photos: photos.checked });
-      void makeSmallFile(address); // before visitors come
+      void prepareSmallFile(address); // before visitors come
       latest = share.id;
       made.replaceChildren(link(`${location.origin}${at(share.path)}`, name));
       label.value = "";

@@ -44,7 +44,9 @@ const TURN_MS = 350;
  * @property {string} [url]  address of a file of splats: .ply, compressed .ply or .sog
  * @property {(say: (text: string) => void, begun: Promise<unknown>) => Promise<Source>} [find]  finds the file, in place of an
  *   address; `begun` settles once the engine and the picture are loaded
- * @property {ArrayBuffer | Uint8Array} [bytes]  its bytes, in place of an address
+ * @property {ArrayBuffer | Uint8Array | Blob} [bytes]  its bytes, in place of an address
+ * @property {boolean} [levels]  whether it is a .lod.zip, of which only those parts are loaded that a view needs
+ * @property {Source} [whole]  the model in one file, where `find` may give one in parts
  * @property {string} [model]  address of a stored model, as /v1/models/{id}: the server renders it where there is no WebGL
  * @property {Camera[]} [cameras]  of the photos: they tell where up is, where to look, and how far away to be. Without
  *   any, -y is up, and the dense middle of the Gaussians is seen from the side
@@ -188,6 +190,7 @@ export class View extends EventTarget {
           background: options.background === "white" ? [1, 1, 1] : [0, 0, 0],
           again: () => this.again(),
           drawn: () => this.poster.remove(),
+          trouble: (message) => this.say(message),
         });
         const begun = Promise.allSettled([engine, options.poster ? this.poster.decode() : null]);
         source = options.find?.((text) => this.say(text), begun);
@@ -217,7 +220,7 @@ export class View extends EventTarget {
     if (source && this.kind === "webgl") this.source = await source;
     this.say("");
     if (this.source.url || this.source.bytes || this.kind !== "webgl") await this.load(this.source);
-    if (!options.camera && !options.cameras?.length && this.surface instanceof Splats) this.frameMiddle(this.points);
+    if (!options.camera && !options.cameras?.length && this.surface instanceof Splats) this.frameMiddle(this.surface.sample);
     this.again();
   }
 
@@ -232,7 +235,7 @@ export class View extends EventTarget {
 
   /** @param {Source} source */
   async load(source) {
-    const told = this.surface instanceof Splats && source.url;
+    let told = this.surface instanceof Splats && source.url;
     const loading = `Loading ${source.what ?? "the model"}`;
     if (told) this.say(loading);
     try {
@@ -241,6 +244,7 @@ export class View extends EventTarget {
       });
     } finally {
       if (told) this.say("");
+      told = undefined; // of a model in levels of detail, parts arrive later
     }
   }
 
@@ -257,6 +261,11 @@ export class View extends EventTarget {
   /** The positions of the Gaussians that are drawn, x, y and z in turn; null where the server draws them. */
   get points() {
     return this.surface instanceof Splats ? this.surface.points : null;
+  }
+
+  /** Whether the parts of the model are loaded as they are seen, so that the positions of all Gaussians are not known. */
+  get inParts() {
+    return this.surface instanceof Splats && this.surface.chunks !== null;
   }
 
   /** Distance from the camera beyond which nothing is drawn. */
@@ -447,6 +456,7 @@ export class View extends EventTarget {
     this.overlay.draw(this.pose, height / 2 / Math.tan(this.fovY / 2), this.ratio);
     this.frames += 1;
     element.dataset.frames = `${this.frames}`;
+    element.dataset.settled = `${surface.settled}`;
     this.dispatchEvent(new Event("frame"));
   }
 

@@ -19,6 +19,7 @@ from splatmill_worker.splat.formats import (
     splat,
     spz,
     streamed_sog,
+    streamed_zip,
 )
 from splatmill_worker.splat.formats.contents import NO_OFFSET, Contents, Offset
 from splatmill_worker.splat.gaussians import Gaussians
@@ -61,6 +62,7 @@ CODECS: dict[str, Codec] = {
     ".sog": Codec(sog.read, sog.write),
     "meta.json": Codec(sog.read, None),
     "lod-meta.json": Codec(streamed_sog.read, streamed_sog.write),
+    ".lod.zip": Codec(streamed_zip.read, streamed_zip.write),
     ".glb": Codec(glb.read, glb.write),
 }
 """One for each of `MODEL_FORMATS`; a test compares them."""

@@ -99,7 +99,7 @@ def write(
         zipfile.ZipFile(part, "w", zipfile.ZIP_STORED) as archive,
     ):
         for name, content in encoded(gaussians, offset=offset, antialiased=antialiased, centroids=centroids):
-            archive.writestr(_member(name), content)
+            archive.writestr(member(name), content)
     return gaussians.count
 
 
@@ -267,7 +267,7 @@ def _webp(plane: Plane) -> bytes:
     return stream.getvalue()
 
 
-def _member(name: str) -> zipfile.ZipInfo:
+def member(name: str) -> zipfile.ZipInfo:
     """The same bytes for the same model: without the time."""
     return zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))
 

@@ -46,7 +46,7 @@ async function show(sides) {
     h("a", { href: `/models/${encodeURIComponent(side.model.id)}` }, nameOf(side.model, "Model")), h("div", { class: "muted" }, figures(side.model))))));
   const views = await Promise.all(sides.map(async (side, i) => {
     try {
-      return await openModel(boxes[i], { ...side, files: side.model.files }, { label: nameOf(side.model, "Model") });
+      return await openModel(boxes[i], { ...side, gaussians: side.model.gaussians, files: side.model.files }, { label: nameOf(side.model, "Model") });
     } catch (error) {
       boxes[i].append(noticeOf(/** @type {Error} */ (error)));
       return null;

@@ -9,7 +9,7 @@ import { CANCELLING, FINAL, badgeKind, badgeText } from "../job_states.js";
 import { labelButton, starButton, tagLinks } from "../labels.js";
 import { titleOf } from "../new/titles.js";
 import { confirmAction, noticeOf, notify, startShell } from "../shell.js";
-import { makeSmallFile } from "../viewer/small_file.js";
+import { prepareSmallFile } from "../viewer/small_file.js";
 import { Course, stageName } from "./course.js";
 import { LiveScene } from "./live_scene.js";
 import { estimateOf, notificationButton, secondsLeft, sentenceOf, showNotification } from "./left.js";
@@ -98,7 +98,7 @@ function heard(record) {
 function ended() {
   stream.close();
   if (course.state === "succeeded" && !FINAL.includes(job.state)) {
-    void makeSmallFile(`/v1/models/${encodeURIComponent(job.model ?? id)}`); // before the model's page asks for it
+    void prepareSmallFile(`/v1/models/${encodeURIComponent(job.model ?? id)}`); // before the model's page asks for it
   }
   byId("notify").replaceChildren();
   if (notifies) showNotification(nameOf(job, "Job"), `${badgeText(course.state, false)}.`);

@@ -80,7 +80,7 @@ export class Stage {
     this.view?.dispose();
     this.view = null;
     try {
-      this.view = await openModel(byId("viewer"), { ...shown, presentation: this.presentation, files: shown.model.files }, {
+      this.view = await openModel(byId("viewer"), { ...shown, presentation: this.presentation, gaussians: shown.model.gaussians, files: shown.model.files }, {
         kind,
         antialias: antialias(shown.report),
         background: shown.background,

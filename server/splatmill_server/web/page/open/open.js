@@ -7,6 +7,8 @@ import { open } from "../viewer.js";
 
 /** @type {import("../viewer.js").View | null} */
 let view = null;
+/** How the name of a model in levels of detail ends. */
+const LEVELS = ".lod.zip";
 /** The number of files so far: one that was chosen while another was read is the one that is shown. */
 let chosen = 0;
 
@@ -34,12 +36,13 @@ async function show(file) {
   const mine = (chosen += 1);
   byId("problem").replaceChildren();
   try {
-    const contents = await file.arrayBuffer();
+    const levels = file.name.toLowerCase().endsWith(LEVELS);
+    const contents = levels ? file : await file.arrayBuffer();
     if (mine !== chosen) return;
     view?.dispose();
     view = null;
     box.replaceChildren();
-    view = await open(box, { bytes: contents, label: file.name });
+    view = await open(box, { bytes: contents, levels, label: file.name });
     byId("title").textContent = file.name;
     document.title = `${file.name} - Splatmill`;
     byId("figures").textContent = `${bytes(file.size)}, shown from this device.`;

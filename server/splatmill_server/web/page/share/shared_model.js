@@ -38,7 +38,7 @@ async function view(box, model, name) {
     const [{ cameras }, presentation, { openModel }, { present }] = await Promise.all([
       has ? get(`${address}/cameras`) : { cameras: [] }, get(`${address}/presentation`), import("../opening.js"), import("../viewer/presented.js"),
     ]);
-    const shown = { address, files: model.files, cameras, presentation };
+    const shown = { address, gaussians: model.gaussians, files: model.files, cameras, presentation };
     present(box, await openModel(box, shown, { antialias: model.antialias, label: name }), presentation, name);
   } catch (error) {
     // The picture of the model, which the page came with, stays.

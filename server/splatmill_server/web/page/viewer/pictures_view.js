@@ -39,6 +39,7 @@ export class Pictures {
     this.ended = new AbortController();
     this.pictures = 0;
     this.gaussians = 0;
+    this.settled = true;
   }
 
   /** The stored model is shown, whatever the source; a changed one is found by its ETag. */

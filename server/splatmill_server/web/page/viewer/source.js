@@ -4,7 +4,8 @@
 import { ViewerError } from "./errors.js";
 
 /**
- * @typedef {{url?: string, bytes?: ArrayBuffer | Uint8Array, what?: string}} Source  a file of a model
+ * @typedef {{url?: string, bytes?: ArrayBuffer | Uint8Array | Blob, levels?: boolean, what?: string}} Source  a file of a model
+ *   levels: whether it is a .lod.zip, of which only those parts are loaded that a view needs
  *   what: what is loaded, in words; left out, "the model"
  */
 

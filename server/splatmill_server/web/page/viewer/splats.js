@@ -6,13 +6,23 @@
  * @import {Pose, Vec} from "./pose.js"
  * @import {Source} from "./source.js"
  */
+import { Chunks } from "./chunks.js";
 import { ViewerError } from "./errors.js";
 import { MODIFIER, parametersOf } from "./left_out.js";
+import { INDEX, Pieces } from "./pieces.js";
 import { ROW } from "./selection.js";
 import { opened } from "./source.js";
 
 /** A mask without any Gaussian. */
 const NOTHING = new Uint8Array(ROW);
+
+/** More levels than a model has: the coarsest is drawn until finer ones are there. */
+const ALL_LEVELS = 100;
+/** Updates after a frame, without drawing, in which levels are chosen; PlayCanvas does that in every tenth. */
+const UPDATES = 12;
+/** Over the size of the scene: how far the camera moves until levels are chosen anew, and up to where they are fine. */
+const STEP = 0.02;
+const NEAR = 0.25;
 
 /** Name of a uniform: the centre and radius of the sphere outside of which nothing is drawn; radius 0 draws all. */
 const SPHERE = "visible_sphere";
@@ -28,9 +38,9 @@ export function hasWebGL() {
 export class Splats {
   /**
    * @param {HTMLCanvasElement} canvas
-   * @param {{antialias?: boolean, background?: [number, number, number], again: () => void, drawn: () => void}} options
+   * @param {{antialias?: boolean, background?: [number, number, number], again: () => void, drawn: () => void, trouble: (message: string) => void}} options
    *   antialias: whether the model was trained with antialiasing. again: called when another frame has to be drawn.
-   *   drawn: called when a frame shows a model.
+   *   drawn: called when a frame shows a model. trouble: called with a sentence when a part of a model is given up.
    * @returns {Promise<Splats>}
    */
   static async open(canvas, options) {
@@ -59,7 +69,16 @@ export class Splats {
     this.canvas = canvas;
     this.again = options.again;
     this.drawn = options.drawn;
+    this.trouble = options.trouble;
     this.sorted = false;
+    /** Whether the parts that are there are no picture yet, but the surroundings of one. */
+    this.early = false;
+    /** Whether the last frame has all details that are to be seen from where it was drawn. */
+    this.settled = false;
+    /** Updates that are still to be made. */
+    this.updates = 0;
+    /** The request for the next one; 0 where there is none. */
+    this.updating = 0;
     const settings = new pc.AppOptions();
     settings.graphicsDevice = device;
     settings.componentSystems = [pc.CameraComponentSystem, pc.GSplatComponentSystem];
@@ -81,6 +100,7 @@ export class Splats {
     gsplat.useFog = false;
     gsplat.antiAlias = options.antialias ?? false;
     gsplat.dataFormat = pc.GSPLATDATA_LARGE;
+    gsplat.lodUnderfillLimit = ALL_LEVELS;
     changeShaders(pc, device);
     gsplat.material.update();
     this.app.start();
@@ -90,6 +110,9 @@ export class Splats {
       this.again();
     });
     this.app.systems.gsplat.on("frame:request", () => this.again());
+    this.app.systems.gsplat.on("frame:ready", (/** @type {any} */ _camera, /** @type {any} */ _layer, /** @type {boolean} */ ready, /** @type {number} */ pending) => {
+      this.settled = ready && pending === 0;
+    });
     device.on("devicerestored", () => this.again());
     /** @type {any} */
     this.splats = null;
@@ -103,6 +126,8 @@ export class Splats {
     this.texture = null;
     this.gaussians = 0;
     this.loads = 0;
+    /** What loads the parts of a model in levels of detail; null where the model is loaded whole. @type {Chunks | null} */
+    this.chunks = null;
   }
 
   /**
@@ -112,41 +137,126 @@ export class Splats {
    */
   async load(source, progress) {
     const { pc, app } = this;
-    const { format, contents } = await opened(source);
+    const [asset, chunks] = source.levels ? await this.index(source, progress) : [await this.whole(source, progress), null];
     if (!this.app) return;
-    // PlayCanvas keeps what it loads by its address, so that each model needs another one.
-    const url = `model-${(this.loads += 1)}.${format}`;
-    const asset = new pc.Asset(url, "gsplat", { url, filename: url, contents });
-    if (progress) asset.on("progress", progress);
-    try {
-      await loaded(app.assets, asset);
-      if (!this.app) return;
-      if (!(asset.resource.gsplatData.numSplats > 0)) {
-        throw new ViewerError("empty", "The model has no Gaussians, so there is nothing to draw.");
-      }
-    } catch (error) {
-      app.assets?.remove(asset);
-      asset.unload();
-      throw error;
-    }
-    const before = this.splats;
-    this.splats = new pc.Entity("splats", this.app);
+    const { resource } = asset;
+    const { splats: before, chunks: others } = this;
+    this.splats = new pc.Entity("splats", app);
     this.splats.addComponent("gsplat", { asset });
     app.root.addChild(this.splats);
     this.leaveOut(this.limits);
-    this.gaussians = asset.resource.gsplatData.numSplats;
-    if (before) {
-      const old = app.assets.get(before.gsplat.asset);
-      before.destroy();
-      app.assets.remove(old);
-      old.unload();
+    [this.chunks, this.gaussians] = [chunks, resource.gsplatData?.numSplats ?? resource.numSplats];
+    try {
+      if (chunks) await this.firstPicture(chunks, resource.aabb.halfExtents.length());
+    } catch (error) {
+      if (this.app) {
+        this.end(this.splats);
+        [this.splats, this.chunks] = [before, others];
+      }
+      throw error;
     }
+    if (!this.app) return;
+    if (before) this.end(before);
     this.again();
   }
 
-  /** The positions of the Gaussians, x, y and z in turn; null where they are not known. @returns {Float32Array | null} */
+  /** @param {any} splats  an entity with a model */
+  end(splats) {
+    const asset = this.app.assets.get(splats.gsplat.asset);
+    splats.destroy();
+    this.drop(asset);
+  }
+
+  /** @param {any} asset */
+  drop(asset) {
+    this.app?.assets.remove(asset);
+    asset.unload();
+  }
+
+  /** The asset of a model that is loaded whole. @param {Source} source @param {(done: number, total: number) => void} [progress] */
+  async whole(source, progress) {
+    const { format, contents } = await opened(source);
+    return this.app && this.asset(format, contents, progress);
+  }
+
+  /**
+   * The asset of a file that is there.
+   * @param {string} format @param {Response} contents
+   * @param {(done: number, total: number) => void} [progress]
+   */
+  async asset(format, contents, progress) {
+    // PlayCanvas keeps what it loads by its address, so that each model needs another one.
+    const url = `model-${(this.loads += 1)}.${format}`;
+    const asset = new this.pc.Asset(url, "gsplat", { url, filename: url, contents });
+    if (progress) asset.on("progress", progress);
+    return this.added(asset, () => asset.resource.gsplatData.numSplats);
+  }
+
+  /** Load an asset, which has Gaussians. @param {any} asset @param {() => number} count */
+  async added(asset, count) {
+    try {
+      await loaded(this.app.assets, asset);
+      if (this.app && !(count() > 0)) throw new ViewerError("empty", "The model has no Gaussians, so there is nothing to draw.");
+    } catch (error) {
+      this.drop(asset);
+      throw error;
+    }
+    return asset;
+  }
+
+  /**
+   * The asset of the index of a model in levels of detail, and what loads its chunks.
+   * @param {Source} source @param {(done: number, total: number) => void} [progress]
+   * @returns {Promise<[any, Chunks | null]>}
+   */
+  async index(source, progress) {
+    const pieces = await Pieces.open(source);
+    if (!this.app) return [null, null];
+    const said = () => progress?.(pieces.loaded, 0);
+    said();
+    const url = URL.createObjectURL(new Blob([/** @type {BlobPart} */ (pieces.index)]));
+    try {
+      const asset = new this.pc.Asset(INDEX, "gsplat", { url: `${url}#/${INDEX}`, filename: INDEX });
+      await this.added(asset, () => asset.resource.numSplats);
+      if (!this.app) return [null, null];
+      const chunks = new Chunks(pieces, {
+        read: (sog) => this.asset("sog", new Response(/** @type {BodyInit} */ (sog))),
+        drop: (chunk) => this.drop(chunk),
+        loaded: () => {
+          said();
+          this.again();
+        },
+        failed: (error) => this.trouble(`A part of the model is shown without its details. ${error.message}`),
+      });
+      asset.resource.octree.assetLoader = chunks;
+      return [asset, chunks];
+    } finally {
+      URL.revokeObjectURL(url);
+    }
+  }
+
+  /** Wait for the coarsest level. @param {Chunks} chunks @param {number} size  half of the diagonal of the scene */
+  async firstPicture(chunks, size) {
+    const { gsplat } = this.app.scene;
+    gsplat.lodUpdateDistance = STEP * size;
+    this.splats.gsplat.lodBaseDistance = NEAR * size;
+    this.early = true;
+    this.again();
+    try {
+      await chunks.first;
+    } finally {
+      this.early = this.sorted = false;
+    }
+  }
+
+  /** The positions of all Gaussians, x, y and z in turn; null where the model is not loaded whole. @returns {Float32Array | null} */
   get points() {
     return this.app?.assets.get(this.splats?.gsplat.asset)?.resource.centers ?? null;
+  }
+
+  /** The positions of Gaussians that are spread as all are: of all, or of a chunk. @returns {Float32Array | null} */
+  get sample() {
+    return this.points ?? this.chunks?.scene?.resource.centers ?? null;
   }
 
   /** Show what an edit would leave out, dimmed or not at all; null shows everything as ever. @param {LeftOut | null} limits */
@@ -204,7 +314,21 @@ export class Splats {
     app.renderNextFrame = true;
     app.tick(performance.now());
     cancelAnimationFrame(app.frameRequestId); // the viewer decides when the next frame is drawn
-    if (this.sorted) this.drawn();
+    if (this.sorted && !this.early) this.drawn();
+    this.updates = UPDATES;
+    if (this.chunks && !this.updating) this.update();
+  }
+
+  /** Choose what is loaded and drawn of a model in levels of detail, until all of it is there. */
+  update() {
+    this.updating = 0;
+    const { app, chunks } = this;
+    if (!app || !chunks) return;
+    app.tick(performance.now());
+    cancelAnimationFrame(app.frameRequestId);
+    this.updates -= 1;
+    const coming = !this.settled && (chunks.pending || !chunks.missing.size);
+    if (this.updates > 0 || coming) this.updating = requestAnimationFrame(() => this.update());
   }
 
   /**
@@ -222,6 +346,7 @@ export class Splats {
   }
 
   dispose() {
+    cancelAnimationFrame(this.updating);
     this.picker?.destroy();
     this.texture?.destroy();
     const { app } = this;

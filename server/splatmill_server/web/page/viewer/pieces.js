@@ -1,0 +1,238 @@
+/**
+ * A .lod.zip read piece by piece: levels of detail of a model, each chunk of which is a range of the file's bytes.
+ *
+ * The list of its files and the index are at its end (splat/formats/streamed_zip.py writes it so).
+ */
+import { ViewerError } from "./errors.js";
+
+/** @import {Source} from "./source.js" */
+
+/** Name of the index in the archive. */
+export const INDEX = "lod-meta.json";
+
+/** Bytes of the end that are read first, which hold the list and the index of a million Gaussians. */
+const TAIL = 1 << 16;
+
+/** Signs of a zip: the end, an entry of the list, and the bytes that both have without names. */
+const END = 0x06054b50;
+const ENTRY = 0x02014b50;
+const END_BYTES = 22;
+const ENTRY_BYTES = 46;
+/** Bytes before the name of a file where it is stored. */
+const HEAD_BYTES = 30;
+
+/**
+ * @typedef {object} Entry  a file of the archive
+ * @property {string} name
+ * @property {Uint8Array} record  its entry of the list
+ * @property {number} begin  where it begins, its head included
+ * @property {number} end  where the next one does, or the list
+ * @property {number} size  bytes as it is stored
+ * @property {boolean} deflated
+ */
+
+export class Pieces {
+  /**
+   * Read the list and the index.
+   * @param {Source} source
+   * @returns {Promise<Pieces>}
+   * @throws {ViewerError}  where it cannot be had, or is no such archive
+   */
+  static async open({ url, bytes }) {
+    const pieces = new Pieces(bytes ? new Blob([/** @type {BlobPart} */ (bytes)]) : (url ?? ""));
+    await pieces.readList();
+    return pieces;
+  }
+
+  /** @param {Blob | string} file  its address, or itself */
+  constructor(file) {
+    this.file = file;
+    this.etag = "";
+    this.size = 0;
+    /** Bytes that were read so far. */
+    this.loaded = 0;
+    /** By folder, the files in it. @type {Map<string, Entry[]>} */
+    this.folders = new Map();
+    /** The folders of the coarsest level, which the first picture is drawn from. @type {Set<string>} */
+    this.coarsest = new Set();
+  }
+
+  async readList() {
+    const tail = await this.last(TAIL);
+    const start = this.size - tail.length;
+    const seen = viewOf(tail);
+    const at = tail.length - END_BYTES;
+    if (at < 0 || seen.getUint32(at, true) !== END) throw damaged("it does not end as a .zip without a comment does");
+    const [count, length, begin] = [seen.getUint16(at + 10, true), seen.getUint32(at + 12, true), seen.getUint32(at + 16, true)];
+    if (begin + length > start + at) throw damaged("its list of files is not where its end says");
+    const list = begin >= start ? tail.subarray(begin - start, begin - start + length) : await this.read(begin, begin + length);
+    const entries = entriesOf(list, count).sort((a, b) => a.begin - b.begin);
+    for (const [i, entry] of entries.entries()) {
+      entry.end = entries[i + 1]?.begin ?? begin;
+      const folder = folderOf(entry.name);
+      this.folders.set(folder, [...(this.folders.get(folder) ?? []), entry]);
+    }
+    const index = this.folders.get("")?.find(({ name }) => name === INDEX);
+    if (!index) throw damaged(`it holds no ${INDEX}`);
+    const stored = index.begin >= start ? tail.subarray(index.begin - start, index.end - start) : await this.read(index.begin, index.end);
+    /** The index, as bytes of JSON. */
+    this.index = await contentsOf(stored, index);
+    this.coarsest = coarsestOf(this.index);
+  }
+
+  /**
+   * The files of a chunk as a .sog.
+   * @param {string} folder  that its meta.json is in, with a slash at its end
+   * @returns {Promise<Uint8Array>}
+   */
+  async chunk(folder) {
+    const entries = this.folders.get(folder) ?? [];
+    if (!entries.length) throw damaged(`it holds no files in ${folder}`);
+    const begin = entries[0].begin;
+    const files = await this.read(begin, entries[entries.length - 1].end);
+    const list = entries.map(({ record, begin: at, name }) => {
+      const short = new TextEncoder().encode(name.slice(folder.length));
+      const entry = new Uint8Array(ENTRY_BYTES + short.length);
+      entry.set(record.subarray(0, ENTRY_BYTES));
+      entry.set(short, ENTRY_BYTES);
+      const view = viewOf(entry);
+      view.setUint16(28, short.length, true);
+      view.setUint32(30, 0, true); // nothing added, and no comment
+      view.setUint32(42, at - begin, true);
+      return entry;
+    });
+    const length = list.reduce((sum, entry) => sum + entry.length, 0);
+    const end = new DataView(new ArrayBuffer(END_BYTES));
+    end.setUint32(0, END, true);
+    end.setUint16(8, list.length, true);
+    end.setUint16(10, list.length, true);
+    end.setUint32(12, length, true);
+    end.setUint32(16, files.length, true);
+    return joined([files, ...list, new Uint8Array(end.buffer)]);
+  }
+
+  /** The last bytes, at most `count`. @param {number} count */
+  async last(count) {
+    if (this.file instanceof Blob) {
+      this.size = this.file.size;
+      return this.read(Math.max(0, this.size - count), this.size);
+    }
+    return this.fetched(`bytes=-${count}`);
+  }
+
+  /** The bytes from `begin` to before `end`. @param {number} begin @param {number} end */
+  async read(begin, end) {
+    if (!(this.file instanceof Blob)) return this.fetched(`bytes=${begin}-${end - 1}`);
+    const bytes = new Uint8Array(await this.file.slice(begin, end).arrayBuffer());
+    this.loaded += bytes.length;
+    return bytes;
+  }
+
+  /** @param {string} range @returns {Promise<Uint8Array>} */
+  async fetched(range) {
+    const answer = await fetch(/** @type {string} */ (this.file), { headers: { Range: range, ...(this.etag ? { "If-Range": this.etag } : {}) } });
+    if (answer.status !== 206) {
+      void answer.body?.cancel();
+      const why = !answer.ok ? `the server answered ${answer.status}`
+        : this.etag ? "it was changed meanwhile. Reload the page" : "the server, or a proxy before it, sends no parts of files";
+      throw new ViewerError("unreadable", `The model could not be loaded in parts: ${why}.`);
+    }
+    const [, size] = /\/(\d+)$/.exec(answer.headers.get("Content-Range") ?? "") ?? [];
+    this.size = Number(size);
+    this.etag ||= answer.headers.get("ETag") ?? "";
+    const bytes = new Uint8Array(await answer.arrayBuffer());
+    this.loaded += bytes.length;
+    return bytes;
+  }
+}
+
+/** @param {string} why */
+function damaged(why) {
+  return new ViewerError("unreadable", `The model could not be read as levels of detail: ${why}.`);
+}
+
+/** @param {Uint8Array} bytes */
+function viewOf(bytes) {
+  return new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
+}
+
+/** @param {Uint8Array} list @param {number} count @returns {Entry[]} */
+function entriesOf(list, count) {
+  const view = viewOf(list);
+  const found = [];
+  for (let at = 0; found.length < count; ) {
+    if (at + ENTRY_BYTES > list.length || view.getUint32(at, true) !== ENTRY) throw damaged("its list of files is damaged");
+    const [named, added, comment] = [28, 30, 32].map((place) => view.getUint16(at + place, true));
+    const record = list.subarray(at, at + ENTRY_BYTES + named);
+    const method = view.getUint16(at + 10, true);
+    if (method !== 0 && method !== 8) throw damaged("its files are compressed in a way that browsers do not read");
+    found.push({
+      name: new TextDecoder().decode(record.subarray(ENTRY_BYTES)),
+      record,
+      begin: view.getUint32(at + 42, true),
+      end: 0,
+      size: view.getUint32(at + 20, true),
+      deflated: method === 8,
+    });
+    at += ENTRY_BYTES + named + added + comment;
+  }
+  return found;
+}
+
+/** The contents of a file. @param {Uint8Array} stored  it and its head @param {Entry} entry */
+async function contentsOf(stored, { size, deflated }) {
+  const view = viewOf(stored);
+  const begin = HEAD_BYTES + view.getUint16(26, true) + view.getUint16(28, true);
+  const bytes = stored.subarray(begin, begin + size);
+  if (!deflated) return bytes;
+  const whole = new Blob([/** @type {BlobPart} */ (bytes)]).stream().pipeThrough(new DecompressionStream("deflate-raw"));
+  return new Uint8Array(await new Response(whole).arrayBuffer());
+}
+
+/**
+ * The folders of the coarsest level. Fails for an index that PlayCanvas would not survive.
+ * @param {Uint8Array} bytes  the index
+ * @returns {Set<string>}
+ */
+function coarsestOf(bytes) {
+  let index;
+  try {
+    index = JSON.parse(new TextDecoder().decode(bytes));
+  } catch {
+    throw damaged(`its ${INDEX} is no JSON`);
+  }
+  const whole = (/** @type {any} */ number, /** @type {number} */ most) => Number.isInteger(number) && number >= 0 && number < most;
+  const corner = (/** @type {any} */ place) => Array.isArray(place) && place.length === 3 && place.every(Number.isFinite);
+  const { version, filenames, lodLevels, environment, tree } = index ?? {};
+  const named = Array.isArray(filenames) && [...filenames, environment ?? ""].every((name) => typeof name === "string");
+  if (version !== 1 || !named || !whole(lodLevels, 100)) throw damaged(`its ${INDEX} is not of version 1`);
+  const found = new Set();
+  const nodes = [tree];
+  for (let node = nodes.pop(); nodes.length || node !== undefined; node = nodes.pop()) {
+    const levels = Object.keys(node?.lods ?? {});
+    /** @type {any[]} */
+    const places = Object.values(node?.lods ?? {});
+    const fits = corner(node?.bound?.min) && corner(node.bound.max) && (node.lods ? !node.children : Array.isArray(node.children))
+      && places.every((place) => whole(place?.file, filenames.length) && whole(place.offset, 2 ** 31) && whole(place.count, 2 ** 31));
+    if (!fits) throw damaged(`the tree in its ${INDEX} is damaged`);
+    nodes.push(...(node.children ?? []));
+    if (levels.length) found.add(folderOf(filenames[node.lods[Math.max(...levels.map(Number))].file]));
+  }
+  return found;
+}
+
+/** The folder that a path leads to, with a slash at its end. @param {string} path */
+function folderOf(path) {
+  return path.slice(0, path.lastIndexOf("/") + 1);
+}
+
+/** @param {Uint8Array[]} parts */
+function joined(parts) {
+  const whole = new Uint8Array(parts.reduce((sum, part) => sum + part.length, 0));
+  let at = 0;
+  for (const part of parts) {
+    whole.set(part, at);
+    at += part.length;
+  }
+  return whole;
+}

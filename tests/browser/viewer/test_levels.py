@@ -1,0 +1,184 @@
+"""A large model is loaded in parts: the coarsest level first, from few bytes, and at last it is drawn as the whole is.
+
+What the archive holds is tested in tests/worker/splat/formats/test_streamed_zip.py.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import secrets
+import shutil
+import zipfile
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import torch
+from PIL import Image
+from playwright.sync_api import Page, Route, expect
+
+from splatmill_worker.splat.formats import ply
+from splatmill_worker.splat.gaussians import Gaussians, concatenate
+from tests.browser.conftest import Open, SmallModel, requests
+from tests.browser.viewer.test_slow_network import DRAWN, SLOW, slowed
+from tests.support.up import Up
+from tests.support.waiting import wait_for
+
+WHOLE = 2**18
+"""Gaussians up to which a model is loaded whole."""
+
+FIRST_PICTURE = 2_000_000
+"""Most bytes until the scene is drawn: the page, its engine, and those of the model."""
+
+SMALL = {"width": 800, "height": 500}
+"""A window of which little is to be drawn."""
+
+SETTLED = "() => document.querySelector('.view')?.dataset.settled === 'true'"
+
+
+def _many(few: Gaussians) -> Gaussians:
+    """The Gaussians without colours that depend on the view, among many that are hardly to be seen."""
+    few = replace(few, sh=few.sh[:, :1])
+    dust = few.select(torch.arange(few.count).repeat_interleave(WHOLE // few.count + 1))
+    generator = torch.Generator().manual_seed(0)
+    dust.means[:] += dust.log_scales.exp() * torch.randn(dust.means.shape, generator=generator)
+    dust.log_scales[:] = -9
+    dust.logit_opacities[:] = -5
+    return concatenate(few, dust)
+
+
+@pytest.fixture(scope="module")
+def large(service: Up, model: SmallModel) -> Iterator[str]:
+    """The id of the small model with many more Gaussians, whose levels of detail are made."""
+    models = service.data / "storage/models"
+    large = models / secrets.token_hex(8)
+    shutil.copytree(models / model.id, large, ignore=shutil.ignore_patterns("formats", "orbits", "meshes"))
+    found = ply.read(large / "model.ply")
+    ply.write(large / "model.ply", _many(found.gaussians), offset=found.offset)
+    record = json.loads((large / "job.json").read_text())
+    (large / "job.json").write_text(
+        json.dumps(record | {"id": large.name, "model": large.name, "sha256": {}})
+    )
+    answer = service.http.head(f"/v1/models/{large.name}/download/lod.zip", timeout=600)
+    assert answer.status_code == 200
+    yield large.name
+    shutil.rmtree(large)
+
+
+def _seen(page: Page) -> npt.NDArray[np.float64]:
+    with Image.open(io.BytesIO(page.locator(".view canvas").first.screenshot())) as shown:
+        return np.asarray(shown.convert("RGB")) / 255.0
+
+
+def _psnr(one: npt.NDArray[np.float64], other: npt.NDArray[np.float64]) -> float:
+    return float(-10 * np.log10(max(np.square(one - other).mean(), 1e-12)))
+
+
+def test_the_first_picture_comes_from_few_bytes_and_the_last_is_that_of_the_whole(
+    service: Up, large: str, open_window: Open
+) -> None:
+    visit = open_window(service, viewport=SMALL)
+    page = visit.page
+    loaded = slowed(visit, {**SLOW, "downloadThroughput": 1_000_000})
+    asked = requests(page)
+    page.goto(f"/models/{large}", wait_until="commit")
+    page.wait_for_function(DRAWN, polling=50)
+    assert sum(loaded) < FIRST_PICTURE
+    assert not page.evaluate(SETTLED)
+    page.wait_for_function(SETTLED)
+    parts = [line for line in asked if line.startswith("GET") and line.endswith("/download/lod.zip")]
+    index = json.loads(_archive(service, large).read("lod-meta.json"))
+    assert len(parts) == 1 + len(index["filenames"]) + ("environment" in index), (
+        "the end, and each chunk once"
+    )
+    in_parts = _seen(page)
+
+    # The brush needs to know where each Gaussian is: the whole model takes the place of its parts.
+    assert not [line for line in asked if line.endswith("/download/sog")]
+    page.get_by_role("button", name="Crop and clean").click()
+    page.get_by_role("button", name="Brush").click()
+    wait_for(lambda: [line for line in asked if line.endswith("/download/sog")])
+    expect(page.locator(".view .said")).to_be_empty()
+    page.get_by_role("button", name="Select in the middle").click()
+    expect(page.get_by_text(re.compile(r"[1-9][\d,]* of 26[\d,]+ Gaussians are selected"))).to_be_visible()
+    page.get_by_role("button", name="Crop and clean").click()
+    page.evaluate("scrollTo(0, 0)")  # the view is where it was
+    wait_for(lambda: _psnr(_seen(page), in_parts) > 35)
+
+
+def _archive(service: Up, large: str) -> zipfile.ZipFile:
+    answer = service.http.get(f"/v1/models/{large}/download/lod.zip")
+    return zipfile.ZipFile(io.BytesIO(answer.content))
+
+
+def test_a_link_shows_it_in_parts_and_a_part_that_fails_is_asked_for_again(
+    service: Up, large: str, open_window: Open
+) -> None:
+    link = service.http.post(f"/v1/models/{large}/shares", json={"expires_in": "1h"}).json()["path"]
+    visit = open_window(service, viewport=SMALL)
+    visit.watched.allow("ERR_FAILED|ERR_ABORTED")
+    failed: list[str] = []
+
+    def sometimes(route: Route) -> None:
+        wanted = route.request.headers.get("range", "bytes=-")
+        if len(failed) < 3 and not wanted.startswith("bytes=-"):
+            failed.append(wanted)
+            route.abort()
+        else:
+            route.continue_()
+
+    visit.page.route("**/download/lod.zip", sometimes)
+    visit.page.goto(link)
+    visit.page.wait_for_function(SETTLED)
+    expect(visit.page.locator(".view .said")).to_be_empty()
+    assert len(failed) == 3
+    service.http.delete(f"/v1/models/{large}/shares/{link.rpartition('/')[-1]}")
+
+
+def test_why_nothing_is_shown_is_said(service: Up, large: str, open_window: Open) -> None:
+    visit = open_window(service, viewport=SMALL)
+    visit.watched.allow("503")
+    page = visit.page
+
+    def end_only(route: Route) -> None:
+        if route.request.headers.get("range", "bytes=-").startswith("bytes=-"):
+            route.continue_()
+        else:
+            route.fulfill(status=503)
+
+    page.route("**/download/lod.zip", end_only)
+    page.goto(f"/models/{large}")
+    expect(page.get_by_text("could not be loaded in parts: the server answered 503")).to_be_visible()
+    page.unroute("**/download/lod.zip")
+    page.route("**/download/lod.zip", lambda route: route.fulfill(status=200, body=b"PK"))
+    page.reload()
+    expect(page.get_by_text("a proxy before it, sends no parts of files")).to_be_visible()
+
+
+def test_a_file_in_parts_is_opened_and_what_is_none_is_refused_by_name(
+    service: Up, large: str, open_window: Open, tmp_path: Path
+) -> None:
+    page = open_window(service, viewport=SMALL).page
+    whole = service.http.get(f"/v1/models/{large}/download/lod.zip").content
+    odd = {
+        "sog": service.http.get(f"/v1/models/{large}/download/sog", timeout=120).content,
+        "cut": whole[:-1],
+        "empty": b"",
+    }
+    page.goto("/open")
+    for name, contents in odd.items():
+        (tmp_path / f"{name}.lod.zip").write_bytes(contents)
+        page.get_by_label("Choose a file").set_input_files(tmp_path / f"{name}.lod.zip")
+        expect(page.get_by_role("alert")).to_contain_text(
+            f"{name}.lod.zip: The model could not be read as levels"
+        )
+    (tmp_path / "mine.lod.zip").write_bytes(whole)
+    page.get_by_label("Choose a file").set_input_files(tmp_path / "mine.lod.zip")
+    expect(page.get_by_role("heading", level=1)).to_have_text("mine.lod.zip")
+    page.wait_for_function(SETTLED)
+    assert len(set(np.round(_seen(page) * 255).astype(int).flatten())) > 100
