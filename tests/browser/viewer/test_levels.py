@@ -13,6 +13,7 @@ import shutil
 import zipfile
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -86,24 +87,29 @@ def test_the_first_picture_comes_from_few_bytes_and_the_last_is_that_of_the_whol
     page = visit.page
     loaded = slowed(visit, {**SLOW, "downloadThroughput": 1_000_000})
     asked = requests(page)
+    ranges: list[str] = []
+    page.on("request", lambda request: ranges.append(request.headers.get("range", "")))
+    page.on("requestfinished", lambda request: ranges.append("end of " + request.headers.get("range", "")))
     page.goto(f"/models/{large}", wait_until="commit")
     page.wait_for_function(DRAWN, polling=50)
     assert sum(loaded) < FIRST_PICTURE
+    coarsest = _ranges(service, large)[-1]
+    assert [each for each in ranges[: ranges.index(f"end of {coarsest}")] if each.startswith("bytes=")] == [
+        "bytes=-65536",
+        coarsest,
+    ], "nothing takes bytes from the coarsest level"
     assert not page.evaluate(SETTLED)
     page.wait_for_function(SETTLED)
     parts = [line for line in asked if line.startswith("GET") and line.endswith("/download/lod.zip")]
-    index = json.loads(_archive(service, large).read("lod-meta.json"))
-    assert len(parts) == 1 + len(index["filenames"]) + ("environment" in index), (
-        "the end, and each chunk once"
-    )
+    assert len(parts) == 1 + len(_ranges(service, large)), "the end, and each chunk once"
     in_parts = _seen(page)
 
-    # The brush needs to know where each Gaussian is: the whole model takes the place of its parts.
+    # An edit needs to know where each Gaussian is: the whole model takes the place of its parts.
     assert not [line for line in asked if line.endswith("/download/sog")]
     page.get_by_role("button", name="Crop and clean").click()
-    page.get_by_role("button", name="Brush").click()
     wait_for(lambda: [line for line in asked if line.endswith("/download/sog")])
     expect(page.locator(".view .said")).to_be_empty()
+    page.get_by_role("button", name="Brush").click()
     page.get_by_role("button", name="Select in the middle").click()
     expect(page.get_by_text(re.compile(r"[1-9][\d,]* of 26[\d,]+ Gaussians are selected"))).to_be_visible()
     page.get_by_role("button", name="Crop and clean").click()
@@ -111,9 +117,14 @@ def test_the_first_picture_comes_from_few_bytes_and_the_last_is_that_of_the_whol
     wait_for(lambda: _psnr(_seen(page), in_parts) > 35)
 
 
-def _archive(service: Up, large: str) -> zipfile.ZipFile:
+def _ranges(service: Up, large: str) -> list[str]:
+    """The ranges of bytes of the chunks, the coarsest level last."""
     answer = service.http.get(f"/v1/models/{large}/download/lod.zip")
-    return zipfile.ZipFile(io.BytesIO(answer.content))
+    begins: dict[str, int] = {}
+    with zipfile.ZipFile(io.BytesIO(answer.content)) as archive:
+        for entry in archive.infolist():
+            begins.setdefault(entry.filename.rpartition("/")[0], entry.header_offset)
+    return [f"bytes={begin}-{end - 1}" for begin, end in pairwise(sorted(begins.values()))]
 
 
 def test_a_link_shows_it_in_parts_and_a_part_that_fails_is_asked_for_again(
@@ -137,7 +148,23 @@ def test_a_link_shows_it_in_parts_and_a_part_that_fails_is_asked_for_again(
     visit.page.wait_for_function(SETTLED)
     expect(visit.page.locator(".view .said")).to_be_empty()
     assert len(failed) == 3
-    service.http.delete(f"/v1/models/{large}/shares/{link.rpartition('/')[-1]}")
+
+    visit.watched.allow("404")
+    visit.page.route("**/download/lod.zip", lambda route: _refuse(route, _ranges(service, large)[:-1]))
+    visit.page.reload()
+    said = "A part of the model is shown without its details, until the page is reloaded"
+    expect(visit.page.locator(".view .said")).to_contain_text(said)
+    expect(visit.page.locator(".view .said")).to_contain_text("the server answered 404")
+    assert len(set(np.round(_seen(visit.page) * 255).astype(int).flatten())) > 100, (
+        "the coarsest level is drawn"
+    )
+
+
+def _refuse(route: Route, ranges: list[str]) -> None:
+    if route.request.headers.get("range") in ranges:
+        route.fulfill(status=404)
+    else:
+        route.continue_()
 
 
 def test_why_nothing_is_shown_is_said(service: Up, large: str, open_window: Open) -> None:

@@ -10,6 +10,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,18 @@ from PIL import Image
 from splatmill.backplane import rendering
 from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.storage import Storage
-from splatmill.schema import DEPTH_SCALE_HEADER, CameraSpec, Format, OrbitRequest, Output, RenderRequest
+from splatmill.schema import (
+    DEPTH_SCALE_HEADER,
+    CameraSpec,
+    ConversionRequest,
+    Format,
+    OrbitRequest,
+    Output,
+    RenderRequest,
+)
+from splatmill_worker.splat.formats import ply
 from tests.support.ball import BALL, store_ball
+from tests.support.gaussians import some_gaussians
 from tests.support.waiting import wait_for
 
 FRONT = CameraSpec.looking_at((4, 0, 0), (0, 0, 0), width=64, height=48)
@@ -201,6 +212,26 @@ def test_an_orbit_that_nobody_waits_for_is_not_rendered_on(http: httpx.Client, s
     # 3600 frames take minutes
     wait_for(lambda: not list(temporary(storage).glob("splatmill-render-*")), 20)
     assert picture(http, RenderRequest(camera=FRONT)).status_code == 200
+
+
+def test_pictures_are_rendered_while_a_model_is_converted(
+    http: httpx.Client, storage: Storage, tmp_path: Path
+) -> None:
+    large = "large0000001"  # its harmonics take seconds, as those of a million Gaussians take a minute
+    ply.write(tmp_path / "model.ply", some_gaussians(60_000, 3))
+    storage.put(layout.model_file(large, "model.ply"), tmp_path / "model.ply")
+    storage.put(layout.job_record(large), b"{}")
+    assert picture(http, RenderRequest(camera=FRONT)).status_code == 200
+    with ThreadPoolExecutor(1) as pool:
+        body = ConversionRequest(format="sog").model_dump_json()
+        conversion = pool.submit(http.post, rendering.convert_path(large), content=body)
+        wait_for(lambda: http.get(rendering.HEALTH).json()["admitted"] == 1)
+        for width in range(50, 60):
+            camera = FRONT.model_copy(update={"width": width})
+            assert pixels(picture(http, RenderRequest(camera=camera))).shape == (48, width, 3)
+        assert not conversion.done()
+        assert conversion.result().status_code == 200
+    storage.delete_prefix(layout.model(large))
 
 
 def _flipped(camera: CameraSpec) -> list[list[float]]:

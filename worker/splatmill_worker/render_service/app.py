@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Awaitable, Callable
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from pydantic import BaseModel, ValidationError
 from starlette.applications import Starlette
@@ -30,6 +30,7 @@ from splatmill.schema import (
     DOWNLOADS,
     EDIT_HEADER,
     PROBLEM_MEDIA_TYPE,
+    Conversion,
     ConversionRequest,
     EditModel,
     JoinOrbit,
@@ -47,6 +48,9 @@ from splatmill_worker.render_service.model_cache import LoadedModel, ModelCache
 from splatmill_worker.render_service.render_queue import ClientGone, QueueFull, RenderQueue
 from splatmill_worker.render_service.scratch import ScratchMiddleware, scratch
 from splatmill_worker.scene import Camera
+
+if TYPE_CHECKING:
+    from splatmill_worker.splat.gaussians import Gaussians
 
 MAX_WAITING = 48
 """Number of requests that may wait while one is rendered. An image takes a fraction of a second."""
@@ -287,14 +291,14 @@ class RenderApp:
         form = DOWNLOADS.get(body.format)
         if form is None:
             raise FormatUnknown(body.format)
-        model = await self._queue.run(
-            lambda: self._cache.get(model_id), request.is_disconnected, _client(request)
-        )
         folder = scratch(request)
-        path, back, record = await self._conversions.run(
-            partial(conversion.convert, model, form, folder, self._storage),
-            request.is_disconnected,
-            _client(request),
+
+        def convert() -> tuple[LoadedModel, Path, Gaussians, Conversion]:
+            model = self._cache.get(model_id)  # none is held while its conversion waits
+            return model, *conversion.convert(model, form, folder, self._storage)
+
+        model, path, back, record = await self._conversions.run(
+            convert, request.is_disconnected, _client(request)
         )
         views, what = await run_in_threadpool(conversion.pictures_of, self._storage, model_id)
         behind = await run_in_threadpool(conversion.background_of, self._storage, model_id)

@@ -23,7 +23,7 @@ class ClientGone(Exception):
 
 
 class RenderQueue:
-    """Runs one piece of work at a time, so that it has all cores.
+    """Runs one piece of work at a time, so that it has all cores but for what another queue runs.
 
     A client is named by its owner and a text of its own, with a slash between (`rendering.client_of`). Owners take
     turns, and so do the clients of an owner: one that asks for a hundred pictures, or for a video, which is as many,

@@ -35,7 +35,7 @@ export function openModel(box, { address, gaussians, files, cameras, presentatio
     cameras: cameras.map(({ camera }) => camera),
     camera,
     poster,
-    whole: { ...wholeFile(address), what: "the whole model, on which a selection is shown" },
+    whole: { ...wholeFile(address), what: "the whole model, which edits are shown on; the server makes its file once" },
     find: (say, begun) => smallest(address, gaussians, say, begun),
   });
 }
@@ -56,6 +56,7 @@ async function smallest(address, gaussians, say, begun) {
   if (size("ply") <= SMALL) return whole;
   if (size(smallFormat(gaussians)) !== null) return small;
   const made = makeSmallFile(address, gaussians);
+  if (small.levels && size(smallFormat(0)) !== null) return wholeFile(address); // the levels are for the next visit
   await begun;
   const patience = size("ply") / speed();
   if (patience > SOON) say("The server makes a small file of the model, once for all visitors.");

@@ -45,7 +45,7 @@ const TURN_MS = 350;
  * @property {(say: (text: string) => void, begun: Promise<unknown>) => Promise<Source>} [find]  finds the file, in place of an
  *   address; `begun` settles once the engine and the picture are loaded
  * @property {ArrayBuffer | Uint8Array | Blob} [bytes]  its bytes, in place of an address
- * @property {boolean} [levels]  whether it is a .lod.zip, of which only those parts are loaded that a view needs
+ * @property {boolean} [levels]  whether it is a .lod.zip, whose parts are loaded one after the other
  * @property {Source} [whole]  the model in one file, where `find` may give one in parts
  * @property {string} [model]  address of a stored model, as /v1/models/{id}: the server renders it where there is no WebGL
  * @property {Camera[]} [cameras]  of the photos: they tell where up is, where to look, and how far away to be. Without
@@ -117,6 +117,8 @@ export class View extends EventTarget {
     this.homeTangents = this.tangents;
     /** @type {Splats | Pictures | null} */
     this.surface = null;
+    /** @type {Promise<void> | undefined} */
+    this.loadingWhole = undefined;
 
     this.element = document.createElement("div");
     this.element.className = "view";
@@ -266,6 +268,16 @@ export class View extends EventTarget {
   /** Whether the parts of the model are loaded as they are seen, so that the positions of all Gaussians are not known. */
   get inParts() {
     return this.surface instanceof Splats && this.surface.chunks !== null;
+  }
+
+  /** Load all of a model that is shown in parts, and show it so from now on. */
+  async loadWhole() {
+    const { whole } = this.options;
+    if (!this.inParts || !whole) return;
+    await (this.loadingWhole ??= this.replace(whole).finally(() => {
+      this.loadingWhole = undefined;
+    }));
+    this.source = whole;
   }
 
   /** Distance from the camera beyond which nothing is drawn. */

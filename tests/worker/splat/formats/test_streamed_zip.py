@@ -77,21 +77,17 @@ def test_one_that_somebody_packed_again_is_read(tmp_path: Path, written: Path) -
     assert torch.equal(registry.read(again).gaussians.means, registry.read(written).gaussians.means)
 
 
-def _with(change: Callable[[zipfile.ZipFile], None]) -> Callable[[Path, Path], None]:
-    def make(written: Path, path: Path) -> None:
-        path.write_bytes(written.read_bytes())
-        with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive:
-            change(archive)
+def _without(
+    begin: str, add: Callable[[zipfile.ZipFile], None] = lambda archive: None
+) -> Callable[[Path, Path], None]:
+    """What writes the archive again without the files whose names begin so, and with something in their place."""
 
-    return make
-
-
-def _without(begin: str) -> Callable[[Path, Path], None]:
     def make(written: Path, path: Path) -> None:
         with zipfile.ZipFile(written) as old, zipfile.ZipFile(path, "w") as new:
             for name in old.namelist():
                 if not name.startswith(begin):
                     new.writestr(name, old.read(name))
+            add(new)
 
     return make
 
@@ -102,8 +98,17 @@ def _without(begin: str) -> Callable[[Path, Path], None]:
         (lambda written, path: path.write_bytes(b""), "damaged or cut off"),
         (lambda written, path: path.write_bytes(written.read_bytes()[:-1000]), "damaged or cut off"),
         (lambda written, path: zipfile.ZipFile(path, "w").close(), "it holds no lod-meta.json"),
-        (_with(lambda archive: archive.writestr("x", bytes(2**26))), "unpacked, and the archive has"),
-        (_without("0_0/meta"), r"names 0_0/meta\.json, which is missing"),
+        (
+            _without(
+                "lod-meta", lambda new: new.writestr("lod-meta.json", bytes(2**24), zipfile.ZIP_DEFLATED)
+            ),
+            "has 16777216 bytes, more than",
+        ),
+        (
+            _without("0_0/sh0", lambda new: new.writestr("0_0/sh0.webp", bytes(2**28), zipfile.ZIP_DEFLATED)),
+            "sh0.webp has 268435456 bytes, more than",
+        ),
+        (_without("0_0/meta"), r"0_0/meta\.json is missing"),
         (_without("0_0/quats.webp"), r"quats\.webp is missing"),
     ],
 )
@@ -116,20 +121,20 @@ def test_what_is_no_such_archive_is_named(
         registry.read(path)
 
 
-def test_names_that_lead_out_of_the_folder_stay_in_it(tmp_path: Path, written: Path) -> None:
+@pytest.mark.parametrize("folder", ["/etc/", "../../", "a/../b/"])
+def test_nothing_outside_of_the_archive_is_read(tmp_path: Path, written: Path, folder: str) -> None:
     path = tmp_path / "in/odd.lod.zip"
     path.parent.mkdir()
-    _with(lambda archive: archive.writestr("../../escaped", b"x"))(written, path)
-    assert registry.read(path).gaussians.count == 40_000
-    assert not list(tmp_path.rglob("escaped"))
+    with zipfile.ZipFile(written) as old, zipfile.ZipFile(path, "w") as new:
+        new.writestr(f"{folder}lod-meta.json", old.read("lod-meta.json"))
+    with pytest.raises(ModelUnreadable, match="is missing in it"):
+        registry.read(path)
+    assert [each.name for each in tmp_path.rglob("*")] == ["in", "odd.lod.zip"]
 
 
-def test_a_longer_list_than_is_read_is_refused(
-    tmp_path: Path, written: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(streamed_zip, "MAX_LIST_BYTES", 100)
-    with pytest.raises(ModelUnreadable, match="at most are read"):
-        registry.read(written)
+def test_a_longer_list_than_is_read_is_refused(tmp_path: Path, written: Path) -> None:
+    with pytest.raises(ModelUnreadable, match="more than are read"):
+        streamed_zip.read(written, list_bytes=100)
     with pytest.raises(FileNotFoundError):
         registry.read(tmp_path / "none.lod.zip")
 

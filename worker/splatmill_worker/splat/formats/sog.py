@@ -172,7 +172,7 @@ def read(path: Path) -> Contents:
     """
     try:
         with sog_files.opened(path) as files:
-            return _contents(files)
+            return contents(files)
     except FileNotFoundError:
         raise
     except UnusablePicture as error:
@@ -272,7 +272,8 @@ def member(name: str) -> zipfile.ZipInfo:
     return zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))
 
 
-def _contents(files: sog_files.Files) -> Contents:
+def contents(files: sog_files.Files) -> Contents:
+    """The model in the files of a SOG. Raises what `read` turns into ModelUnreadable."""
     meta = json.loads(sog_files.contents(files, "meta.json", MAX_META_BYTES))
     version = meta.get("version") if isinstance(meta, dict) else None
     if version != VERSION:

@@ -27,11 +27,15 @@ class Files(Protocol):
     def read(self, name: str) -> bytes: ...
 
 
-class _Members:
-    """The members of an archive. Raises ValueError for one that is encrypted or missing."""
+class Members:
+    """The members of an archive. Raises ValueError for one that is encrypted or missing.
 
-    def __init__(self, archive: zipfile.ZipFile) -> None:
+    folder: what their names begin with in the archive: empty, or with a slash at its end.
+    """
+
+    def __init__(self, archive: zipfile.ZipFile, folder: str = "") -> None:
         self._archive = archive
+        self._folder = folder
 
     def size(self, name: str) -> int:
         return self._info(name).file_size
@@ -39,12 +43,12 @@ class _Members:
     def read(self, name: str) -> bytes:
         if self._info(name).flag_bits & _ENCRYPTED:
             raise ValueError(f"{name[:80]} is encrypted")
-        return self._archive.read(name)
+        return self._archive.read(self._folder + name)
 
     def _info(self, name: str) -> zipfile.ZipInfo:
-        if name not in self._archive.NameToInfo:
-            raise ValueError(f"{name[:80]} is missing in it")
-        return self._archive.NameToInfo[name]
+        if (path := self._folder + name) not in self._archive.NameToInfo:
+            raise ValueError(f"{path[-80:]} is missing in it")
+        return self._archive.NameToInfo[path]
 
 
 class _Beside:
@@ -80,7 +84,7 @@ def opened(path: Path) -> Iterator[Files]:
     bounded = BoundedReads(io.FileIO(path), MAX_LIST_BYTES, _list_too_long)
     with bounded as file, zipfile.ZipFile(cast(IO[bytes], file)) as archive:
         file.most = None  # each member is compared with what is expected of it
-        yield _Members(archive)
+        yield Members(archive)
 
 
 def _list_too_long(size: int) -> ValueError:

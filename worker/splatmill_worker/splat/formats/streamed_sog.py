@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -30,6 +30,8 @@ VERSION = 1
 
 CHUNK = 65536
 """Gaussians of a chunk at most, which is what a viewer loads at a time: about 1.2 MB."""
+
+INDEX = "lod-meta.json"
 
 ENVIRONMENT = "env/meta.json"
 
@@ -76,6 +78,18 @@ def write_levels(
 ) -> None:
     """Write levels as `write` does. chunk: Gaussians of a chunk at most, unless a leaf has more."""
     path.unlink(missing_ok=True)
+    for name, content in encoded(levels, offset=offset, antialiased=antialiased, chunk=chunk):
+        atomic_write(path if name == INDEX else path.parent / name, content, sync=name == INDEX)
+
+
+def encoded(
+    levels: Levels,
+    *,
+    offset: Offset = NO_OFFSET,
+    antialiased: bool = False,
+    chunk: int = CHUNK,
+) -> Iterator[tuple[str, bytes]]:
+    """The files of a model by their paths: those of each chunk together, and the index last. Else as `write_levels`."""
     chunks = [part for number, level in enumerate(levels.levels) for part in _chunks(number, level, chunk)]
     names, places = list[str](), dict[int, int]()
     for part in chunks:
@@ -84,10 +98,10 @@ def write_levels(
         level = levels.levels[part.level]
         begin, end = level.runs[part.first].first, level.runs[part.last - 1]
         rows = torch.arange(begin, end.first + end.count)
-        _write_sog(path.parent / names[-1], level.gaussians.select(rows), offset, antialiased)
+        yield from _sog(names[-1], level.gaussians.select(rows), offset, antialiased)
     if levels.surroundings is not None:
-        _write_sog(path.parent / ENVIRONMENT, levels.surroundings, offset, antialiased)
-    atomic_write(path, json.dumps(_index(levels, chunks, names), separators=(",", ":")), sync=True)
+        yield from _sog(ENVIRONMENT, levels.surroundings, offset, antialiased)
+    yield INDEX, json.dumps(_index(levels, chunks, names), separators=(",", ":")).encode()
 
 
 def read(path: Path) -> Contents:
@@ -98,7 +112,7 @@ def read(path: Path) -> Contents:
     try:
         if path.stat().st_size > MAX_INDEX_BYTES:
             raise ValueError(f"it has more than {MAX_INDEX_BYTES} bytes")
-        names = _finest(json.loads(path.read_bytes()))
+        names = finest(json.loads(path.read_bytes()))
     except FileNotFoundError:
         raise
     except (OSError, ValueError, KeyError, TypeError, IndexError, AttributeError, RecursionError) as error:
@@ -108,6 +122,11 @@ def read(path: Path) -> Contents:
         if not (part := path.parent / name).is_file():
             raise ModelUnreadable(f"{path.name} names {name[:80]}, which is missing beside it.")
         parts.append(sog.read(part))
+    return joined(parts)
+
+
+def joined(parts: Sequence[Contents]) -> Contents:
+    """The contents of at least one SOG as those of one model."""
     degree = max(part.gaussians.degree for part in parts)
     whole = concatenate(*(part.gaussians.padded(degree) for part in parts))
     return Contents(whole, parts[0].offset, parts[0].antialiased, parts[0].notes)
@@ -131,9 +150,9 @@ def _chunks(number: int, level: Level, most: int) -> Iterator[Chunk]:
     yield Chunk(number, first, len(level.runs))
 
 
-def _write_sog(meta: Path, gaussians: Gaussians, offset: Offset, antialiased: bool) -> None:
+def _sog(meta: str, gaussians: Gaussians, offset: Offset, antialiased: bool) -> Iterator[tuple[str, bytes]]:
     for name, content in sog.encoded(gaussians, offset=offset, antialiased=antialiased):
-        atomic_write(meta.with_name(name), content)
+        yield str(PurePosixPath(meta).with_name(name)), content
 
 
 def _index(levels: Levels, chunks: list[Chunk], names: list[str]) -> dict[str, Any]:
@@ -197,8 +216,12 @@ def _short(number: float) -> float:
     return float(f"{number:.7g}")
 
 
-def _finest(index: Any) -> list[str]:
-    """The SOG of level 0 and of the environment. Raises ValueError, KeyError or TypeError for another document."""
+def finest(index: Any) -> list[str]:
+    """The paths of the SOG of level 0 and of the environment, none of which leads out of the folder.
+
+    index: the document in a `lod-meta.json`. Raises ValueError, KeyError, TypeError, IndexError or AttributeError for
+    another one.
+    """
     if index["version"] != VERSION:
         raise ValueError(f"its version is {index['version']!r:.20}, and only version {VERSION} is read")
     found = dict[int, None]()

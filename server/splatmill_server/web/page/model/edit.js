@@ -87,11 +87,8 @@ export class Edit {
   /** @param {View} view */
   attach(view) {
     this.view = view;
-    if (!this.began) {
-      const { width, height } = view.getCamera();
-      this.box = (view.points && boxOf(view.points, view.focus, REACH * view.distance)) ?? boxAround(view.focus, SHARE * view.distance * Math.tan(view.fovY / 2) * Math.min(1, width / height));
-      this.began = true;
-    }
+    if (!this.began) this.fit(view);
+    this.began = true;
     this.handles?.dispose();
     this.handles = new BoxHandles(view, (box, done) => {
       this.box = box;
@@ -103,10 +100,33 @@ export class Edit {
     this.draw();
   }
 
+  /** Lay the box around what lies before the camera. @param {View} view */
+  fit(view) {
+    const { width, height } = view.getCamera();
+    this.box = (view.points && boxOf(view.points, view.focus, REACH * view.distance)) ?? boxAround(view.focus, SHARE * view.distance * Math.tan(view.fovY / 2) * Math.min(1, width / height));
+  }
+
+  /** Show all Gaussians, as what an edit leaves out is judged one by one. @param {View} view */
+  async showWhole(view) {
+    try {
+      await view.loadWhole();
+    } catch (error) {
+      this.state.replaceChildren(noticeOf(/** @type {Error} */ (error)));
+      return;
+    }
+    if (view !== this.view) return;
+    if (!this.before.length) {
+      this.fit(view);
+      this.chosen = this.snapshot();
+    }
+    this.selecting.choose(this.selecting.chosen);
+  }
+
   /** @param {boolean} on */
   turn(on) {
     this.on = on;
     this.panel.hidden = !on;
+    if (on && this.view?.inParts) void this.showWhole(this.view);
     if (!on) this.selecting.take(null);
     this.draw();
   }

@@ -78,19 +78,7 @@ export class Selecting {
     this.tool = tool;
     for (const [button, name] of /** @type {const} */ ([[this.brush, "brush"], [this.lasso, "lasso"]])) button.setAttribute("aria-pressed", String(tool === name));
     this.drawing?.show(tool !== null);
-    if (tool && this.view?.inParts) void this.loadWhole(this.view);
     if (tool) this.say(tool === "brush" ? "Paint on the view. Shift, the right button or two fingers still move the scene." : "Draw around what is to go. Shift, the right button or two fingers still move the scene.");
-  }
-
-  /** Show all Gaussians, of which the server else counts those that are selected. @param {View} view */
-  async loadWhole(view) {
-    if (!view.options.whole) return;
-    try {
-      await view.replace(view.options.whole);
-      this.on.changed();
-    } catch (error) {
-      this.say(/** @type {Error} */ (error).message);
-    }
   }
 
   /** Stamp the brush onto the middle of the view, as the keyboard does. */
@@ -169,7 +157,7 @@ export class Selecting {
     const { centers } = this;
     if (!chosen.strokes.length) this.say("Nothing is selected.");
     else if (centers && this.made) this.say(`${number(this.made.selected)} of ${number(centers.length / 3)} Gaussians are selected.`);
-    else this.say("The server counts what is selected, as this view does not know all Gaussians.");
+    else this.say("The server counts what is selected, as this view draws no Gaussians, or has not loaded all.");
   }
 
   /** 255 for each Gaussian that is selected; null where nothing is, or the view draws no Gaussians. @returns {Uint8Array | null} */

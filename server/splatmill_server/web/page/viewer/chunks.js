@@ -7,8 +7,6 @@
 
 /** Chunks that are loaded at once. */
 const AT_ONCE = 2;
-/** Milliseconds after which a chunk that did not come is asked for again; after the last one it is given up. */
-const PAUSES = [1000, 4000, 16000];
 
 export class Chunks {
   /**
@@ -17,7 +15,7 @@ export class Chunks {
    * @param {(sog: Uint8Array) => Promise<any>} on.read  makes an asset of PlayCanvas of a .sog
    * @param {(asset: any) => void} on.drop  ends an asset
    * @param {() => void} on.loaded  called when a chunk is there, which the next frame shows
-   * @param {(error: Error) => void} on.failed  called when a chunk was given up
+   * @param {(error: Error) => void} on.failed  called when a chunk was given up, in whose place a coarser level is drawn
    */
   constructor(pieces, on) {
     this.pieces = pieces;
@@ -30,7 +28,14 @@ export class Chunks {
     this.loading = new Set();
     /** Those that were given up. @type {Set<string>} */
     this.missing = new Set();
+    /** Whether none is loaded any more. */
     this.ended = false;
+    /** Called when the network is there again. */
+    this.again = () => {
+      this.missing.clear();
+      this.on.loaded();
+    };
+    addEventListener("online", this.again);
     /** The first chunk of the coarsest level that was there. @type {any} */
     this.scene = null;
     /** @type {() => void} */
@@ -49,10 +54,11 @@ export class Chunks {
     return this.loading.size + this.waiting.size;
   }
 
-  /** @param {string} url @param {number} [priority]  the more, the sooner; left out, at once: the surroundings */
-  load(url, priority = Infinity) {
+  /** @param {string} url @param {number} [priority]  the more, the sooner; left out, as it was */
+  load(url, priority) {
     if (this.ended || this.assets.has(url) || this.loading.has(url) || this.missing.has(url)) return;
-    this.waiting.set(url, priority);
+    const surrounds = folderOf(url) === this.pieces.surroundings;
+    this.waiting.set(url, surrounds ? Infinity : (priority ?? this.waiting.get(url) ?? 0));
     queueMicrotask(() => this.next()); // PlayCanvas names all that a frame needs, one after the other
   }
 
@@ -70,6 +76,7 @@ export class Chunks {
   unload(url) {
     this.waiting.delete(url);
     this.loading.delete(url);
+    this.missing.delete(url);
     const asset = this.assets.get(url);
     this.assets.delete(url);
     if (asset) this.on.drop(asset);
@@ -78,6 +85,7 @@ export class Chunks {
 
   destroy() {
     this.ended = true;
+    removeEventListener("online", this.again);
     this.begun();
     this.waiting.clear();
     this.loading.clear();
@@ -101,20 +109,11 @@ export class Chunks {
     const folder = folderOf(url);
     const coarse = this.pieces.coarsest.has(folder);
     let asset = null;
-    for (let tries = 0; !asset && this.loading.has(url); tries += 1) {
-      try {
-        asset = await this.on.read(await this.pieces.chunk(folder));
-      } catch (error) {
-        if (tries === PAUSES.length) {
-          if (this.loading.delete(url)) {
-            this.missing.add(url);
-            if (coarse) this.lost(/** @type {Error} */ (error));
-            this.on.failed(/** @type {Error} */ (error));
-          }
-        } else {
-          await new Promise((resolve) => setTimeout(resolve, PAUSES[tries]));
-        }
-      }
+    try {
+      asset = await this.on.read(await this.pieces.chunk(folder));
+    } catch (error) {
+      this.lose(url, /** @type {Error} */ (error), coarse);
+      return;
     }
     if (this.loading.delete(url)) {
       this.assets.set(url, asset);
@@ -123,8 +122,22 @@ export class Chunks {
         this.begun();
       }
       this.on.loaded();
-    } else if (asset) {
+    } else {
       this.on.drop(asset); // it was not wanted any more
+    }
+    this.next();
+  }
+
+  /** Give up a chunk, and all where the server refuses them. @param {string} url @param {Error} error @param {boolean} coarse */
+  lose(url, error, coarse) {
+    if (this.loading.delete(url)) {
+      this.missing.add(url);
+      if (/** @type {any} */ (error).reason === "refused") {
+        this.ended = true;
+        this.waiting.clear();
+      }
+      if (coarse) this.lost(error);
+      if (this.scene) this.on.failed(error);
     }
     this.next();
   }

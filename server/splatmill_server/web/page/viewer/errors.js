@@ -4,7 +4,7 @@ export const LOADING = "The model is still being loaded. Try again in a moment."
 /** Why a model cannot be shown. */
 export class ViewerError extends Error {
   /**
-   * @param {"no_webgl" | "no_engine" | "unreadable" | "format" | "empty"} reason
+   * @param {"no_webgl" | "no_engine" | "unreadable" | "refused" | "format" | "empty"} reason
    * @param {string} message  a sentence for the person in front of the page
    * @param {ErrorOptions} [options]
    */

@@ -13,11 +13,18 @@ export const INDEX = "lod-meta.json";
 /** Bytes of the end that are read first, which hold the list and the index of a million Gaussians. */
 const TAIL = 1 << 16;
 
+/** Milliseconds after which a part that did not come is asked for again; after the last one it is given up. */
+const PAUSES = [1000, 4000, 16000];
+/** Statuses after which asking again may help, besides those over 499. */
+const PASSING = [408, 425, 429];
+
 /** Signs of a zip: the end, an entry of the list, and the bytes that both have without names. */
 const END = 0x06054b50;
 const ENTRY = 0x02014b50;
 const END_BYTES = 22;
 const ENTRY_BYTES = 46;
+/** Depth of a tree at most, which PlayCanvas walks by calls in calls. */
+const DEEPEST = 200;
 /** Bytes before the name of a file where it is stored. */
 const HEAD_BYTES = 30;
 
@@ -55,6 +62,8 @@ export class Pieces {
     this.folders = new Map();
     /** The folders of the coarsest level, which the first picture is drawn from. @type {Set<string>} */
     this.coarsest = new Set();
+    /** The folder of the surroundings; empty where there are none. */
+    this.surroundings = "";
   }
 
   async readList() {
@@ -67,17 +76,20 @@ export class Pieces {
     if (begin + length > start + at) throw damaged("its list of files is not where its end says");
     const list = begin >= start ? tail.subarray(begin - start, begin - start + length) : await this.read(begin, begin + length);
     const entries = entriesOf(list, count).sort((a, b) => a.begin - b.begin);
+    const indices = entries.filter(({ name }) => name === INDEX || name.endsWith(`/${INDEX}`));
+    const index = indices.sort((a, b) => a.name.split("/").length - b.name.split("/").length)[0];
+    if (!index) throw damaged(`it holds no ${INDEX}`);
+    const outer = folderOf(index.name); // of an archive that somebody has packed again
     for (const [i, entry] of entries.entries()) {
       entry.end = entries[i + 1]?.begin ?? begin;
-      const folder = folderOf(entry.name);
+      if (!entry.name.startsWith(outer)) continue;
+      const folder = folderOf(entry.name).slice(outer.length);
       this.folders.set(folder, [...(this.folders.get(folder) ?? []), entry]);
     }
-    const index = this.folders.get("")?.find(({ name }) => name === INDEX);
-    if (!index) throw damaged(`it holds no ${INDEX}`);
     const stored = index.begin >= start ? tail.subarray(index.begin - start, index.end - start) : await this.read(index.begin, index.end);
     /** The index, as bytes of JSON. */
     this.index = await contentsOf(stored, index);
-    this.coarsest = coarsestOf(this.index);
+    [this.coarsest, this.surroundings] = foldersOf(this.index);
   }
 
   /**
@@ -91,7 +103,7 @@ export class Pieces {
     const begin = entries[0].begin;
     const files = await this.read(begin, entries[entries.length - 1].end);
     const list = entries.map(({ record, begin: at, name }) => {
-      const short = new TextEncoder().encode(name.slice(folder.length));
+      const short = new TextEncoder().encode(name.slice(name.lastIndexOf("/") + 1));
       const entry = new Uint8Array(ENTRY_BYTES + short.length);
       entry.set(record.subarray(0, ENTRY_BYTES));
       entry.set(short, ENTRY_BYTES);
@@ -130,19 +142,36 @@ export class Pieces {
 
   /** @param {string} range @returns {Promise<Uint8Array>} */
   async fetched(range) {
-    const answer = await fetch(/** @type {string} */ (this.file), { headers: { Range: range, ...(this.etag ? { "If-Range": this.etag } : {}) } });
-    if (answer.status !== 206) {
-      void answer.body?.cancel();
-      const why = !answer.ok ? `the server answered ${answer.status}`
-        : this.etag ? "it was changed meanwhile. Reload the page" : "the server, or a proxy before it, sends no parts of files";
-      throw new ViewerError("unreadable", `The model could not be loaded in parts: ${why}.`);
+    for (const pause of PAUSES) {
+      try {
+        return await this.fetchedOnce(range);
+      } catch (error) {
+        if (error instanceof ViewerError && error.reason === "refused") throw error;
+        await new Promise((resolve) => setTimeout(resolve, pause));
+      }
     }
-    const [, size] = /\/(\d+)$/.exec(answer.headers.get("Content-Range") ?? "") ?? [];
-    this.size = Number(size);
-    this.etag ||= answer.headers.get("ETag") ?? "";
-    const bytes = new Uint8Array(await answer.arrayBuffer());
-    this.loaded += bytes.length;
-    return bytes;
+    return this.fetchedOnce(range);
+  }
+
+  /** @param {string} range @returns {Promise<Uint8Array>} */
+  async fetchedOnce(range) {
+    const failed = (/** @type {string} */ why, /** @type {"refused" | "unreadable"} */ reason, /** @type {unknown} */ cause = undefined) =>
+      new ViewerError(reason, `The model could not be loaded in parts: ${why}.`, { cause });
+    try {
+      // Without If-Range, with which browsers keep nothing of what they load.
+      const answer = await fetch(/** @type {string} */ (this.file), { headers: { Range: range } });
+      if (!answer.ok) throw failed(`the server answered ${answer.status}`, answer.status < 500 && !PASSING.includes(answer.status) ? "refused" : "unreadable");
+      const etag = (answer.headers.get("ETag") ?? "").replace(/^W\//, "");
+      this.etag ||= etag;
+      if (etag !== this.etag) throw failed("it was changed meanwhile. Reload the page", "refused");
+      if (answer.status !== 206) throw failed("the server, or a proxy before it, sends no parts of files", "refused");
+      this.size = Number(/\/(\d+)$/.exec(answer.headers.get("Content-Range") ?? "")?.[1]);
+      const bytes = new Uint8Array(await answer.arrayBuffer());
+      this.loaded += bytes.length;
+      return bytes;
+    } catch (error) {
+      throw error instanceof ViewerError ? error : failed("the server could not be reached", "unreadable", error);
+    }
   }
 }
 
@@ -190,11 +219,11 @@ async function contentsOf(stored, { size, deflated }) {
 }
 
 /**
- * The folders of the coarsest level. Fails for an index that PlayCanvas would not survive.
+ * The folders of the coarsest level, and that of the surroundings. Fails for an index that PlayCanvas would not survive.
  * @param {Uint8Array} bytes  the index
- * @returns {Set<string>}
+ * @returns {[Set<string>, string]}
  */
-function coarsestOf(bytes) {
+function foldersOf(bytes) {
   let index;
   try {
     index = JSON.parse(new TextDecoder().decode(bytes));
@@ -207,18 +236,20 @@ function coarsestOf(bytes) {
   const named = Array.isArray(filenames) && [...filenames, environment ?? ""].every((name) => typeof name === "string");
   if (version !== 1 || !named || !whole(lodLevels, 100)) throw damaged(`its ${INDEX} is not of version 1`);
   const found = new Set();
-  const nodes = [tree];
-  for (let node = nodes.pop(); nodes.length || node !== undefined; node = nodes.pop()) {
-    const levels = Object.keys(node?.lods ?? {});
+  const nodes = [{ node: tree, depth: 0 }];
+  for (const { node, depth } of nodes) {
+    const levels = Object.keys(node?.lods ?? {}).map(Number);
     /** @type {any[]} */
     const places = Object.values(node?.lods ?? {});
     const fits = corner(node?.bound?.min) && corner(node.bound.max) && (node.lods ? !node.children : Array.isArray(node.children))
-      && places.every((place) => whole(place?.file, filenames.length) && whole(place.offset, 2 ** 31) && whole(place.count, 2 ** 31));
+      && places.every((place) => whole(place?.file, filenames.length) && whole(place.offset, 2 ** 31) && whole(place.count, 2 ** 31))
+      && levels.every((level) => whole(level, lodLevels)) && depth < DEEPEST;
     if (!fits) throw damaged(`the tree in its ${INDEX} is damaged`);
-    nodes.push(...(node.children ?? []));
-    if (levels.length) found.add(folderOf(filenames[node.lods[Math.max(...levels.map(Number))].file]));
+    for (const child of node.children ?? []) nodes.push({ node: child, depth: depth + 1 });
+    const coarsest = Math.max(...levels.filter((level) => node.lods[level].count > 0));
+    if (coarsest >= 0) found.add(folderOf(filenames[node.lods[coarsest].file]));
   }
-  return found;
+  return [found, folderOf(environment ?? "")];
 }
 
 /** The folder that a path leads to, with a slash at its end. @param {string} path */

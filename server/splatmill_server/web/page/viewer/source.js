@@ -5,7 +5,7 @@ import { ViewerError } from "./errors.js";
 
 /**
  * @typedef {{url?: string, bytes?: ArrayBuffer | Uint8Array | Blob, levels?: boolean, what?: string}} Source  a file of a model
- *   levels: whether it is a .lod.zip, of which only those parts are loaded that a view needs
+ *   levels: whether it is a .lod.zip, whose parts are loaded one after the other
  *   what: what is loaded, in words; left out, "the model"
  */
 

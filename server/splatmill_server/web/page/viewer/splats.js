@@ -2,14 +2,13 @@
  * Draws Gaussians with PlayCanvas on a WebGL canvas. A frame is drawn when one is asked for, and when the splats have
  * been sorted anew, so that a view that nobody moves costs nothing.
  *
+ * @import {Chunks} from "./chunks.js"
  * @import {LeftOut} from "./left_out.js"
  * @import {Pose, Vec} from "./pose.js"
  * @import {Source} from "./source.js"
  */
-import { Chunks } from "./chunks.js";
 import { ViewerError } from "./errors.js";
 import { MODIFIER, parametersOf } from "./left_out.js";
-import { INDEX, Pieces } from "./pieces.js";
 import { ROW } from "./selection.js";
 import { opened } from "./source.js";
 
@@ -20,6 +19,8 @@ const NOTHING = new Uint8Array(ROW);
 const ALL_LEVELS = 100;
 /** Updates after a frame, without drawing, in which levels are chosen; PlayCanvas does that in every tenth. */
 const UPDATES = 12;
+/** Frames that are drawn at most until PlayCanvas says that nothing is to come, where nothing is being loaded. */
+const LOOKS = 5;
 /** Over the size of the scene: how far the camera moves until levels are chosen anew, and up to where they are fine. */
 const STEP = 0.02;
 const NEAR = 0.25;
@@ -77,6 +78,8 @@ export class Splats {
     this.settled = false;
     /** Updates that are still to be made. */
     this.updates = 0;
+    /** Frames that were drawn to learn whether something is to come. */
+    this.looks = 0;
     /** The request for the next one; 0 where there is none. */
     this.updating = 0;
     const settings = new pc.AppOptions();
@@ -141,16 +144,16 @@ export class Splats {
     if (!this.app) return;
     const { resource } = asset;
     const { splats: before, chunks: others } = this;
-    this.splats = new pc.Entity("splats", app);
-    this.splats.addComponent("gsplat", { asset });
-    app.root.addChild(this.splats);
+    const splats = (this.splats = new pc.Entity("splats", app));
+    splats.addComponent("gsplat", { asset });
+    app.root.addChild(splats);
     this.leaveOut(this.limits);
     [this.chunks, this.gaussians] = [chunks, resource.gsplatData?.numSplats ?? resource.numSplats];
     try {
       if (chunks) await this.firstPicture(chunks, resource.aabb.halfExtents.length());
     } catch (error) {
       if (this.app) {
-        this.end(this.splats);
+        this.end(splats);
         [this.splats, this.chunks] = [before, others];
       }
       throw error;
@@ -210,6 +213,7 @@ export class Splats {
    * @returns {Promise<[any, Chunks | null]>}
    */
   async index(source, progress) {
+    const [{ INDEX, Pieces }, { Chunks }] = await Promise.all([import("./pieces.js"), import("./chunks.js")]);
     const pieces = await Pieces.open(source);
     if (!this.app) return [null, null];
     const said = () => progress?.(pieces.loaded, 0);
@@ -223,10 +227,11 @@ export class Splats {
         read: (sog) => this.asset("sog", new Response(/** @type {BodyInit} */ (sog))),
         drop: (chunk) => this.drop(chunk),
         loaded: () => {
+          this.looks = 0;
           said();
           this.again();
         },
-        failed: (error) => this.trouble(`A part of the model is shown without its details. ${error.message}`),
+        failed: (error) => this.trouble(`A part of the model is shown without its details, until the page is reloaded. ${error.message}`),
       });
       asset.resource.octree.assetLoader = chunks;
       return [asset, chunks];
@@ -327,8 +332,9 @@ export class Splats {
     app.tick(performance.now());
     cancelAnimationFrame(app.frameRequestId);
     this.updates -= 1;
-    const coming = !this.settled && (chunks.pending || !chunks.missing.size);
-    if (this.updates > 0 || coming) this.updating = requestAnimationFrame(() => this.update());
+    if (this.settled) this.looks = 0;
+    if (this.updates > 0 || chunks.pending) this.updating = requestAnimationFrame(() => this.update());
+    else if (!this.settled && (this.looks += 1) < LOOKS) this.again();
   }
 
   /**
