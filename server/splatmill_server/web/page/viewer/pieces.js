@@ -69,10 +69,10 @@ export class Pieces {
   async readList() {
     const tail = await this.last(TAIL);
     const start = this.size - tail.length;
-    const seen = viewOf(tail);
+    const end = viewOf(tail);
     const at = tail.length - END_BYTES;
-    if (at < 0 || seen.getUint32(at, true) !== END) throw damaged("it does not end as a .zip without a comment does");
-    const [count, length, begin] = [seen.getUint16(at + 10, true), seen.getUint32(at + 12, true), seen.getUint32(at + 16, true)];
+    if (at < 0 || end.getUint32(at, true) !== END) throw damaged("it does not end as a .zip without a comment does");
+    const [count, length, begin] = [end.getUint16(at + 10, true), end.getUint32(at + 12, true), end.getUint32(at + 16, true)];
     if (begin + length > start + at) throw damaged("its list of files is not where its end says");
     const list = begin >= start ? tail.subarray(begin - start, begin - start + length) : await this.read(begin, begin + length);
     const entries = entriesOf(list, count).sort((a, b) => a.begin - b.begin);
@@ -188,14 +188,14 @@ function viewOf(bytes) {
 /** @param {Uint8Array} list @param {number} count @returns {Entry[]} */
 function entriesOf(list, count) {
   const view = viewOf(list);
-  const found = [];
-  for (let at = 0; found.length < count; ) {
+  const entries = [];
+  for (let at = 0; entries.length < count; ) {
     if (at + ENTRY_BYTES > list.length || view.getUint32(at, true) !== ENTRY) throw damaged("its list of files is damaged");
     const [named, added, comment] = [28, 30, 32].map((place) => view.getUint16(at + place, true));
     const record = list.subarray(at, at + ENTRY_BYTES + named);
     const method = view.getUint16(at + 10, true);
     if (method !== 0 && method !== 8) throw damaged("its files are compressed in a way that browsers do not read");
-    found.push({
+    entries.push({
       name: new TextDecoder().decode(record.subarray(ENTRY_BYTES)),
       record,
       begin: view.getUint32(at + 42, true),
@@ -205,7 +205,7 @@ function entriesOf(list, count) {
     });
     at += ENTRY_BYTES + named + added + comment;
   }
-  return found;
+  return entries;
 }
 
 /** The contents of a file. @param {Uint8Array} stored  it and its head @param {Entry} entry */
@@ -235,7 +235,7 @@ function foldersOf(bytes) {
   const { version, filenames, lodLevels, environment, tree } = index ?? {};
   const named = Array.isArray(filenames) && [...filenames, environment ?? ""].every((name) => typeof name === "string");
   if (version !== 1 || !named || !whole(lodLevels, 100)) throw damaged(`its ${INDEX} is not of version 1`);
-  const found = new Set();
+  const folders = new Set();
   const nodes = [{ node: tree, depth: 0 }];
   for (const { node, depth } of nodes) {
     const levels = Object.keys(node?.lods ?? {}).map(Number);
@@ -247,9 +247,9 @@ function foldersOf(bytes) {
     if (!fits) throw damaged(`the tree in its ${INDEX} is damaged`);
     for (const child of node.children ?? []) nodes.push({ node: child, depth: depth + 1 });
     const coarsest = Math.max(...levels.filter((level) => node.lods[level].count > 0));
-    if (coarsest >= 0) found.add(folderOf(filenames[node.lods[coarsest].file]));
+    if (coarsest >= 0) folders.add(folderOf(filenames[node.lods[coarsest].file]));
   }
-  return [found, folderOf(environment ?? "")];
+  return [folders, folderOf(environment ?? "")];
 }
 
 /** The folder that a path leads to, with a slash at its end. @param {string} path */
