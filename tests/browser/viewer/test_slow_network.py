@@ -30,7 +30,7 @@ SLOWER = {**SLOW, "downloadThroughput": 60_000}
 FIRST_FRAME = 600_000
 """Most bytes until the first full frame of the scene, which is of 3000 Gaussians."""
 
-PICTURE = {"link": 60_000, "frame": 60_000, "model": 150_000}
+PICTURE = {"link": 60_000, "frame": 60_000, "model": 152_000}
 """Most bytes until the picture is seen. Links come with it; the model's page has to learn first what the model has."""
 
 

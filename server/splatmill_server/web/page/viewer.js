@@ -267,7 +267,7 @@ export class View extends EventTarget {
 
   /** Whether the parts of the model are loaded as they are seen, so that the positions of all Gaussians are not known. */
   get inParts() {
-    return this.surface instanceof Splats && this.surface.chunks !== null;
+    return this.surface instanceof Splats && this.surface.parts !== null;
   }
 
   /** Load all of a model that is shown in parts, and show it so from now on. */

@@ -2,8 +2,8 @@
  * Draws Gaussians with PlayCanvas on a WebGL canvas. A frame is drawn when one is asked for, and when the splats have
  * been sorted anew, so that a view that nobody moves costs nothing.
  *
- * @import {Chunks} from "./chunks.js"
  * @import {LeftOut} from "./left_out.js"
+ * @import {Parts} from "./parts.js"
  * @import {Pose, Vec} from "./pose.js"
  * @import {Source} from "./source.js"
  */
@@ -17,14 +17,6 @@ const NOTHING = new Uint8Array(ROW);
 
 /** More levels than a model has: the coarsest is drawn until finer ones are there. */
 const ALL_LEVELS = 100;
-/** Updates after a frame, without drawing, in which levels are chosen; PlayCanvas does that in every tenth. */
-const UPDATES = 12;
-/** Frames that are drawn at most until PlayCanvas says that nothing is to come, where nothing is being loaded. */
-const LOOKS = 5;
-/** Over the size of the scene: how far the camera moves until levels are chosen anew, and up to where they are fine. */
-const STEP = 0.02;
-const NEAR = 0.25;
-
 /** Name of a uniform: the centre and radius of the sphere outside of which nothing is drawn; radius 0 draws all. */
 const SPHERE = "visible_sphere";
 
@@ -72,16 +64,8 @@ export class Splats {
     this.drawn = options.drawn;
     this.trouble = options.trouble;
     this.sorted = false;
-    /** Whether the parts that are there are no picture yet, but the surroundings of one. */
-    this.early = false;
     /** Whether the last frame has all details that are to be seen from where it was drawn. */
     this.settled = false;
-    /** Updates that are still to be made. */
-    this.updates = 0;
-    /** Frames that were drawn to learn whether something is to come. */
-    this.looks = 0;
-    /** The request for the next one; 0 where there is none. */
-    this.updating = 0;
     const settings = new pc.AppOptions();
     settings.graphicsDevice = device;
     settings.componentSystems = [pc.CameraComponentSystem, pc.GSplatComponentSystem];
@@ -129,8 +113,8 @@ export class Splats {
     this.texture = null;
     this.gaussians = 0;
     this.loads = 0;
-    /** What loads the parts of a model in levels of detail; null where the model is loaded whole. @type {Chunks | null} */
-    this.chunks = null;
+    /** The parts of a model in levels of detail; null where the model is loaded whole. @type {Parts | null} */
+    this.parts = null;
   }
 
   /**
@@ -140,21 +124,24 @@ export class Splats {
    */
   async load(source, progress) {
     const { pc, app } = this;
-    const [asset, chunks] = source.levels ? await this.index(source, progress) : [await this.whole(source, progress), null];
-    if (!this.app) return;
-    const { resource } = asset;
-    const { splats: before, chunks: others } = this;
+    const parts = source.levels ? await (await import("./parts.js")).Parts.open(this, source, progress) : null;
+    const asset = parts?.asset ?? (await this.whole(source, progress));
+    if (!this.app) {
+      parts?.chunks.destroy();
+      return;
+    }
+    const { splats: before, parts: others } = this;
     const splats = (this.splats = new pc.Entity("splats", app));
     splats.addComponent("gsplat", { asset });
     app.root.addChild(splats);
     this.leaveOut(this.limits);
-    [this.chunks, this.gaussians] = [chunks, resource.gsplatData?.numSplats ?? resource.numSplats];
+    [this.parts, this.gaussians] = [parts, asset.resource.gsplatData?.numSplats ?? asset.resource.numSplats];
     try {
-      if (chunks) await this.firstPicture(chunks, resource.aabb.halfExtents.length());
+      await parts?.firstPicture(splats);
     } catch (error) {
       if (this.app) {
         this.end(splats);
-        [this.splats, this.chunks] = [before, others];
+        [this.splats, this.parts] = [before, others];
       }
       throw error;
     }
@@ -207,53 +194,6 @@ export class Splats {
     return asset;
   }
 
-  /**
-   * The asset of the index of a model in levels of detail, and what loads its chunks.
-   * @param {Source} source @param {(done: number, total: number) => void} [progress]
-   * @returns {Promise<[any, Chunks | null]>}
-   */
-  async index(source, progress) {
-    const [{ INDEX, Pieces }, { Chunks }] = await Promise.all([import("./pieces.js"), import("./chunks.js")]);
-    const pieces = await Pieces.open(source);
-    if (!this.app) return [null, null];
-    const said = () => progress?.(pieces.loaded, 0);
-    said();
-    const url = URL.createObjectURL(new Blob([/** @type {BlobPart} */ (pieces.index)]));
-    try {
-      const asset = new this.pc.Asset(INDEX, "gsplat", { url: `${url}#/${INDEX}`, filename: INDEX });
-      await this.added(asset, () => asset.resource.numSplats);
-      if (!this.app) return [null, null];
-      const chunks = new Chunks(pieces, {
-        read: (sog) => this.asset("sog", new Response(/** @type {BodyInit} */ (sog))),
-        drop: (chunk) => this.drop(chunk),
-        loaded: () => {
-          this.looks = 0;
-          said();
-          this.again();
-        },
-        failed: (error) => this.trouble(`A part of the model is shown without its details, until the page is reloaded. ${error.message}`),
-      });
-      asset.resource.octree.assetLoader = chunks;
-      return [asset, chunks];
-    } finally {
-      URL.revokeObjectURL(url);
-    }
-  }
-
-  /** Wait for the coarsest level. @param {Chunks} chunks @param {number} size  half of the diagonal of the scene */
-  async firstPicture(chunks, size) {
-    const { gsplat } = this.app.scene;
-    gsplat.lodUpdateDistance = STEP * size;
-    this.splats.gsplat.lodBaseDistance = NEAR * size;
-    this.early = true;
-    this.again();
-    try {
-      await chunks.first;
-    } finally {
-      this.early = this.sorted = false;
-    }
-  }
-
   /** The positions of all Gaussians, x, y and z in turn; null where the model is not loaded whole. @returns {Float32Array | null} */
   get points() {
     return this.app?.assets.get(this.splats?.gsplat.asset)?.resource.centers ?? null;
@@ -261,7 +201,7 @@ export class Splats {
 
   /** The positions of Gaussians that are spread as all are: of all, or of a chunk. @returns {Float32Array | null} */
   get sample() {
-    return this.points ?? this.chunks?.scene?.resource.centers ?? null;
+    return this.points ?? this.parts?.sample ?? null;
   }
 
   /** Show what an edit would leave out, dimmed or not at all; null shows everything as ever. @param {LeftOut | null} limits */
@@ -319,22 +259,8 @@ export class Splats {
     app.renderNextFrame = true;
     app.tick(performance.now());
     cancelAnimationFrame(app.frameRequestId); // the viewer decides when the next frame is drawn
-    if (this.sorted && !this.early) this.drawn();
-    this.updates = UPDATES;
-    if (this.chunks && !this.updating) this.update();
-  }
-
-  /** Choose what is loaded and drawn of a model in levels of detail, until all of it is there. */
-  update() {
-    this.updating = 0;
-    const { app, chunks } = this;
-    if (!app || !chunks) return;
-    app.tick(performance.now());
-    cancelAnimationFrame(app.frameRequestId);
-    this.updates -= 1;
-    if (this.settled) this.looks = 0;
-    if (this.updates > 0 || chunks.pending) this.updating = requestAnimationFrame(() => this.update());
-    else if (!this.settled && (this.looks += 1) < LOOKS) this.again();
+    if (this.sorted && !this.parts?.early) this.drawn();
+    this.parts?.drawn();
   }
 
   /**
@@ -352,7 +278,6 @@ export class Splats {
   }
 
   dispose() {
-    cancelAnimationFrame(this.updating);
     this.picker?.destroy();
     this.texture?.destroy();
     const { app } = this;
