@@ -99,7 +99,8 @@ class RenderApp:
         self._cache = ModelCache(storage, cache_bytes, backend)
         self._meshes = MeshMaker(storage, backend)
         self._queue = RenderQueue(MAX_WAITING, MAX_OF_CLIENT, MAX_OF_OWNER, RESERVED)
-        self._conversions = RenderQueue(MAX_WAITING)  # beside the pictures: a million Gaussians take a minute
+        # Beside the pictures, as the conversion of a million Gaussians takes a minute.
+        self._conversions = RenderQueue(MAX_WAITING, MAX_OF_CLIENT, MAX_OF_OWNER, RESERVED)
 
     def asgi(self) -> Starlette:
         """Return the ASGI application."""
@@ -119,9 +120,8 @@ class RenderApp:
 
     async def health(self, request: Request) -> Response:
         """Respond that the process is alive, and how busy it is."""
-        state = rendering.RendererState(
-            status="ok", admitted=self._queue.admitted_count, cached=self._cache.bytes
-        )
+        admitted = self._queue.admitted_count + self._conversions.admitted_count
+        state = rendering.RendererState(status="ok", admitted=admitted, cached=self._cache.bytes)
         return JSONResponse(state.model_dump())
 
     async def render(self, request: Request) -> Response:
@@ -160,13 +160,14 @@ class RenderApp:
     ) -> Response:
         """Parse the body, compare ETags, wait for a place in the queue, and turn each error into a problem."""
         model_id = request.path_params["model_id"]
+        queue = self._conversions if kind is ConversionRequest else self._queue
         try:
             body = kind.model_validate_json(await request.body() or b"{}")
             etag = await run_in_threadpool(self._etag, model_id, body)
             headers = {"ETag": etag, "Cache-Control": "private, max-age=0, must-revalidate"}
             if _matches(request.headers.get("if-none-match"), etag):
                 return Response(status_code=304, headers=headers)
-            async with self._queue.admitted(_client(request)):
+            async with queue.admitted(_client(request)):
                 return await make(request, model_id, body, headers)
         except ValidationError as error:
             return _problem_response(_problem_of_validation(error))

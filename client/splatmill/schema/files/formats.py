@@ -116,7 +116,7 @@ MODEL_FORMATS: dict[str, ModelFormat] = {
             readable=True,
             writable=True,
             loses="What .sog loses, in the finest level.",
-            readers=("unpacked, SuperSplat", "PlayCanvas", "Babylon.js", "splat-transform"),
+            readers=("SuperSplat, PlayCanvas, Babylon.js and splat-transform once it is unpacked",),
         ),
         ModelFormat(
             ".glb",

@@ -57,9 +57,13 @@ export class Chunks {
   /** @param {string} url @param {number} [priority]  the more, the sooner; left out, as it was */
   load(url, priority) {
     if (this.ended || this.assets.has(url) || this.loading.has(url) || this.missing.has(url)) return;
-    const surrounds = folderOf(url) === this.pieces.surroundings;
-    this.waiting.set(url, surrounds ? Infinity : (priority ?? this.waiting.get(url) ?? 0));
+    this.waiting.set(url, this.surrounds(url) ? Infinity : (priority ?? this.waiting.get(url) ?? 0));
     queueMicrotask(() => this.next()); // PlayCanvas names all that a frame needs, one after the other
+  }
+
+  /** @param {string} url */
+  surrounds(url) {
+    return folderOf(url) === this.pieces.surroundings;
   }
 
   /** Whether one that waited does not any more. @param {string} url */
@@ -67,9 +71,9 @@ export class Chunks {
     return this.waiting.delete(url);
   }
 
-  /** @param {string} url */
+  /** What PlayCanvas draws; of the surroundings nothing before the scene is there. @param {string} url */
   getResource(url) {
-    return this.assets.get(url)?.resource;
+    return this.scene || !this.surrounds(url) ? this.assets.get(url)?.resource : undefined;
   }
 
   /** @param {string} url */

@@ -37,7 +37,7 @@ export class Parts {
   constructor(splats, asset, pieces, progress) {
     this.splats = splats;
     this.asset = asset;
-    /** Whether the parts that are there are no picture yet, but the surroundings of one. */
+    /** Whether nothing of it is to be seen yet. */
     this.early = true;
     /** Updates that are still to be made, and frames that were drawn to learn whether something is to come. */
     this.updates = 0;
