@@ -247,7 +247,8 @@ def test_an_address_that_fails_for_long_is_disabled_with_its_reason(
     assert "4 attempts" in found["disabled_reason"]
     assert "status 500" in found["disabled_reason"]
     # Nothing is sent to it until it is enabled again.
-    ended(app)
+    second = ended(app)
+    wait_for(lambda: f"watched/{second}.json" not in stored(app))
     assert len(log(app, made)) == 1
     assert app.http.post(f"{address}/enable").json().get("disabled_at") is None
     peer.answer = lambda _: Reply()

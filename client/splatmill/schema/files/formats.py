@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from splatmill.schema.files.photos import ARCHIVE_SUFFIXES
+
 
 @dataclass(frozen=True)
 class ModelFormat:
@@ -135,10 +137,15 @@ MODEL_FORMATS: dict[str, ModelFormat] = {
 def is_model_file(name: str) -> bool:
     """Whether a name is that of a file that a training may start from: of a model that can be read, in one file.
 
-    A .zip is none: of those, what is uploaded is unpacked.
+    An archive is none: of those, what is uploaded is unpacked.
     """
     form = format_of(name)
-    return form is not None and form.readable and form.suffix[0] == "." and not form.suffix.endswith(".zip")
+    return (
+        form is not None
+        and form.readable
+        and form.suffix[0] == "."
+        and not form.suffix.endswith(ARCHIVE_SUFFIXES)
+    )
 
 
 POINT_FORMATS: dict[str, str] = {
