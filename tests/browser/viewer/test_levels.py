@@ -10,6 +10,7 @@ import json
 import re
 import secrets
 import shutil
+import time
 import zipfile
 from collections.abc import Iterator
 from dataclasses import replace
@@ -38,6 +39,11 @@ FIRST_PICTURE = 2_000_000
 
 SMALL = {"width": 800, "height": 500}
 """A window of which little is to be drawn."""
+
+SOONER = (
+    "{ const real = setTimeout; window.setTimeout = (call, ms, ...more) => real(call, ms / 5, ...more); }"
+)
+"""Lets a page wait a fifth of its pauses."""
 
 SETTLED = "() => document.querySelector('.view')?.dataset.settled === 'true'"
 
@@ -133,26 +139,48 @@ def test_a_link_shows_it_in_parts_and_a_part_that_fails_is_asked_for_again(
     link = service.http.post(f"/v1/models/{large}/shares", json={"expires_in": "1h"}).json()["path"]
     visit = open_window(service, viewport=SMALL)
     visit.watched.allow("ERR_FAILED|ERR_ABORTED")
-    failed: list[str] = []
+    visit.page.add_init_script(SOONER)
+    failures = ["lost", "busy", "silent"]
+    asked: list[tuple[str, str, float]] = []
 
     def sometimes(route: Route) -> None:
         wanted = route.request.headers.get("range", "bytes=-")
-        if len(failed) < 3 and not wanted.startswith("bytes=-"):
-            failed.append(wanted)
+        failure = failures.pop(0) if failures and not wanted.startswith("bytes=-") else ""
+        asked.append((wanted, failure, time.monotonic()))
+        if failure == "lost":
             route.abort()
-        else:
+        elif failure == "busy":
+            route.fulfill(status=429, headers={"Retry-After": "10"})
+        elif not failure:
             route.continue_()
 
+    visit.watched.allow("429")
     visit.page.route("**/download/lod.zip", sometimes)
     visit.page.goto(link)
     visit.page.wait_for_function(SETTLED)
     expect(visit.page.locator(".view .said")).to_be_empty()
-    assert len(failed) == 3
+    for part, failure, at in asked:
+        later = [then for wanted, _, then in asked if wanted == part and then > at]
+        assert bool(later) == bool(failure), "what failed is asked for again, and nothing else"
+        assert failure != "busy" or later[0] - at > 2.0, "not before the server says"
+
+    # What fails for as long as it is asked for is given up, and comes when the network is there again.
+    finest = _ranges(service, large)[0]
+    visit.page.unroute("**/download/lod.zip")
+    visit.page.route(
+        "**/download/lod.zip",
+        lambda route: route.abort() if route.request.headers.get("range") == finest else route.continue_(),
+    )
+    visit.page.reload()
+    said = "A part of the model is shown without its details"
+    expect(visit.page.locator(".view .said")).to_contain_text(said)
+    visit.page.unroute("**/download/lod.zip")
+    visit.page.evaluate("dispatchEvent(new Event('online'))")
+    expect(visit.page.locator(".view .said")).to_be_empty()
 
     visit.watched.allow("404")
     visit.page.route("**/download/lod.zip", lambda route: _refuse(route, _ranges(service, large)[:-1]))
     visit.page.reload()
-    said = "A part of the model is shown without its details, until the page is reloaded"
     expect(visit.page.locator(".view .said")).to_contain_text(said)
     expect(visit.page.locator(".view .said")).to_contain_text("the server answered 404")
     assert len(set(np.round(_seen(visit.page) * 255).astype(int).flatten())) > 100, (

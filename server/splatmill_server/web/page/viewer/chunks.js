@@ -15,7 +15,8 @@ export class Chunks {
    * @param {(sog: Uint8Array) => Promise<any>} on.read  makes an asset of PlayCanvas of a .sog
    * @param {(asset: any) => void} on.drop  ends an asset
    * @param {() => void} on.loaded  called when a chunk is there, which the next frame shows
-   * @param {(error: Error) => void} on.failed  called when a chunk was given up, in whose place a coarser level is drawn
+   * @param {(error: Error | null) => void} on.failed  called when a chunk was given up, in whose place a coarser level is
+   *   drawn, and with null when all of these are there after all
    */
   constructor(pieces, on) {
     this.pieces = pieces;
@@ -28,6 +29,8 @@ export class Chunks {
     this.loading = new Set();
     /** Those that were given up. @type {Set<string>} */
     this.missing = new Set();
+    /** Those of which `failed` was called. @type {Set<string>} */
+    this.reported = new Set();
     /** Whether none is loaded any more. */
     this.ended = false;
     /** Called when the network is there again. */
@@ -81,6 +84,7 @@ export class Chunks {
     this.waiting.delete(url);
     this.loading.delete(url);
     this.missing.delete(url);
+    this.arrived(url);
     const asset = this.assets.get(url);
     this.assets.delete(url);
     if (asset) this.on.drop(asset);
@@ -125,11 +129,17 @@ export class Chunks {
         this.scene ??= asset;
         this.begun();
       }
+      this.arrived(url);
       this.on.loaded();
     } else {
       this.on.drop(asset); // it was not wanted any more
     }
     this.next();
+  }
+
+  /** Take back what was said of a chunk, which is there or not wanted any more. @param {string} url */
+  arrived(url) {
+    if (this.reported.delete(url) && !this.reported.size) this.on.failed(null);
   }
 
   /** Give up a chunk, and all where the server refuses them. @param {string} url @param {Error} error @param {boolean} coarse */
@@ -141,7 +151,10 @@ export class Chunks {
         this.waiting.clear();
       }
       if (coarse) this.lost(error);
-      if (this.scene) this.on.failed(error);
+      if (this.scene) {
+        this.reported.add(url);
+        this.on.failed(error);
+      }
     }
     this.next();
   }

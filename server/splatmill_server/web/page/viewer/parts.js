@@ -14,6 +14,8 @@ const LOOKS = 5;
 /** Over the size of the scene: how far the camera moves until levels are chosen anew, and up to where they are fine. */
 const STEP = 0.02;
 const NEAR = 0.25;
+/** What the view says of parts that were given up. */
+const ROUGH = "A part of the model is shown without its details. Reload the page to ask for it again.";
 
 export class Parts {
   /**
@@ -52,7 +54,7 @@ export class Parts {
         progress?.(pieces.loaded, 0);
         splats.again();
       },
-      failed: (error) => splats.trouble(`A part of the model is shown without its details, until the page is reloaded. ${error.message}`),
+      failed: (error) => splats.trouble(error ? `${ROUGH} ${error.message}` : ""),
     });
     if (asset.resource) asset.resource.octree.assetLoader = this.chunks;
     progress?.(pieces.loaded, 0);

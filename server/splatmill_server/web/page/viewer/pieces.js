@@ -15,6 +15,10 @@ const TAIL = 1 << 16;
 
 /** Milliseconds after which a part that did not come is asked for again; after the last one it is given up. */
 const PAUSES = [1000, 4000, 16000];
+/** Milliseconds without a byte after which a part is taken for one that does not come. */
+const STALLED = 20_000;
+/** Milliseconds that a server may ask for before the next attempt; what asks for more is given up. */
+const LONGEST_PAUSE = 90_000;
 /** Statuses after which asking again may help, besides those over 499. */
 const PASSING = [408, 425, 429];
 
@@ -147,7 +151,9 @@ export class Pieces {
         return await this.fetchedOnce(range);
       } catch (error) {
         if (error instanceof ViewerError && error.reason === "refused") throw error;
-        await new Promise((resolve) => setTimeout(resolve, pause));
+        const asked = error instanceof Passing ? error.after : 0;
+        if (asked > LONGEST_PAUSE) throw error;
+        await new Promise((resolve) => setTimeout(resolve, Math.max(pause, asked)));
       }
     }
     return this.fetchedOnce(range);
@@ -155,24 +161,78 @@ export class Pieces {
 
   /** @param {string} range @returns {Promise<Uint8Array>} */
   async fetchedOnce(range) {
-    const failed = (/** @type {string} */ why, /** @type {"refused" | "unreadable"} */ reason, /** @type {unknown} */ cause = undefined) =>
-      new ViewerError(reason, `The model could not be loaded in parts: ${why}.`, { cause });
+    const failed = (/** @type {string} */ why) => new ViewerError("refused", sentence(why));
+    const patience = new Patience();
     try {
       // Without If-Range, with which browsers keep nothing of what they load.
-      const answer = await fetch(/** @type {string} */ (this.file), { headers: { Range: range } });
-      if (!answer.ok) throw failed(`the server answered ${answer.status}`, answer.status < 500 && !PASSING.includes(answer.status) ? "refused" : "unreadable");
+      const answer = await fetch(/** @type {string} */ (this.file), { headers: { Range: range }, signal: patience.signal });
+      if (!answer.ok) throw refusal(answer);
       const etag = (answer.headers.get("ETag") ?? "").replace(/^W\//, "");
       this.etag ||= etag;
-      if (etag !== this.etag) throw failed("it was changed meanwhile. Reload the page", "refused");
-      if (answer.status !== 206) throw failed("the server, or a proxy before it, sends no parts of files", "refused");
+      if (etag !== this.etag) throw failed("it was changed meanwhile. Reload the page");
+      if (answer.status !== 206) throw failed("the server, or a proxy before it, sends no parts of files");
       this.size = Number(/\/(\d+)$/.exec(answer.headers.get("Content-Range") ?? "")?.[1]);
-      const bytes = new Uint8Array(await answer.arrayBuffer());
+      const bytes = await patience.bytesOf(answer);
       this.loaded += bytes.length;
       return bytes;
     } catch (error) {
-      throw error instanceof ViewerError ? error : failed("the server could not be reached", "unreadable", error);
+      if (error instanceof ViewerError) throw error;
+      throw new Passing(patience.signal.aborted ? `nothing came for ${STALLED / 1000} s` : "the server could not be reached", 0, error);
+    } finally {
+      patience.end();
     }
   }
+}
+
+/** Why a part did not come where asking again may help. */
+class Passing extends ViewerError {
+  /** @param {string} why @param {number} after  milliseconds for which the server asks to wait @param {unknown} [cause] */
+  constructor(why, after, cause) {
+    super("unreadable", sentence(why), { cause });
+    this.after = after;
+  }
+}
+
+/** Ends a request of which nothing came for STALLED. */
+class Patience {
+  constructor() {
+    this.ending = new AbortController();
+    this.signal = this.ending.signal;
+    this.timer = 0;
+    this.begin();
+  }
+
+  begin() {
+    this.end();
+    this.timer = setTimeout(() => this.ending.abort(), STALLED);
+  }
+
+  end() {
+    clearTimeout(this.timer);
+  }
+
+  /** @param {Response} answer */
+  async bytesOf(answer) {
+    const reader = /** @type {ReadableStream<Uint8Array>} */ (answer.body).getReader();
+    const parts = [];
+    for (let part = await reader.read(); !part.done; part = await reader.read()) {
+      this.begin();
+      parts.push(part.value);
+    }
+    return joined(parts);
+  }
+}
+
+/** @param {string} why */
+function sentence(why) {
+  return `The model could not be loaded in parts: ${why}.`;
+}
+
+/** What an answer that is no success means for further attempts. @param {Response} answer */
+function refusal(answer) {
+  const why = `the server answered ${answer.status}`;
+  if (answer.status < 500 && !PASSING.includes(answer.status)) return new ViewerError("refused", sentence(why));
+  return new Passing(why, 1000 * Number(answer.headers.get("Retry-After") ?? 0) || 0);
 }
 
 /** @param {string} why */
