@@ -42,9 +42,11 @@ def repeated(lines: Iterable[Line]) -> list[str]:
     """Return a sentence for each attempt that did work again whose result was on its disk.
 
     A checkpoint is recorded once it is stored, so a later attempt at the job on this machine must train on behind it.
-    Cameras are stored when the training begins, so no later attempt may recover them again.
+    Cameras are stored when the training begins, so no later attempt may recover them again, and so are the units of a
+    scene in tiles when they are done.
     """
     found: list[str] = []
+    units: set[tuple[str, str]] = set()
     stored: dict[str, int] = {}
     posed: dict[str, int] = {}
     for line in lines:
@@ -57,6 +59,10 @@ def repeated(lines: Iterable[Line]) -> list[str]:
             if step < stored.get(job, 0):
                 found.append(f"{job} stored step {step} after step {stored[job]}")
             stored[job] = max(step, stored.get(job, 0))
+        elif line["what"] == "unit stored":
+            units.add((job, line["unit"]))
+        elif line["what"] == "unit" and (job, line["unit"]) in units:
+            found.append(f"process {pid} did {line['unit']} of {job} again, which was stored")
         elif line["what"] == "step" and line["stage"] == JobState.training and step is None:
             posed.setdefault(job, pid)
         elif line["what"] == "step" and line["stage"] == "mapping" and posed.get(job, pid) != pid:

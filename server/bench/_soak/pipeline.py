@@ -1,13 +1,15 @@
 """The engine's pipeline in the jobs of a soak, with every begin, event, checkpoint and end on record.
 
-It runs in the attempt's process (SPLATMILL_PIPELINE) and changes nothing of what the pipeline does. The record is one
-file of all attempts, SOAK_TRACE, with a JSON line for each of
+It runs in the attempt's process (SPLATMILL_PIPELINE) and changes nothing of what the pipeline does. For a scene in
+tiles, it puts its own function in the place of `tiles.job.run`. The record is one file of all attempts, SOAK_TRACE,
+with a JSON line for each of
 
     begin: the process, the job, whether another attempt at the job runs beside it (`overlap`), and whether its model is
         in storage already (`published`);
     step: an event of the engine, with its `stage` and its `step` of the training where it has them;
     stored: the checkpoint of a step is stored;
     resume: training begins, behind the `step` of the checkpoint that was read, or 0;
+    unit, unit stored: a `unit` of a scene in tiles begins, and its output is in storage;
     end: the pipeline has returned with a whole model.
 
 Times are those of the machine's monotonic clock, which all processes share and no fault of a soak sets.
@@ -26,49 +28,93 @@ from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.storage import Storage, StorageError
 from splatmill.schema import Event, ProgressEvent, StateEvent, TrainOptions
 from splatmill_worker import pipeline
+from splatmill_worker.pipeline.events import Emit
 from splatmill_worker.settings import storage_url
 from splatmill_worker.splat.train import checkpoint
 from splatmill_worker.splat.train.snapshot import Snapshot
+from splatmill_worker.tiles import job
+from splatmill_worker.tiles.stages import Context, run_unit
+
+run_tiles = job.run
 
 
 def run(
     capture: Path,
     workdir: Path,
     options: TrainOptions,
-    emit: Callable[[Event], None],
+    emit: Emit,
     cancelled: Callable[[], bool],
-    *,
-    onlookers: Any = None,
+    **more: Any,
 ) -> Any:
     """Run the pipeline, and record what becomes of it."""
-    job = workdir.parent.name
+    return _recorded(pipeline.run, capture, workdir, options, emit, cancelled, **more)
+
+
+def run_in_tiles(
+    capture: Path,
+    workdir: Path,
+    options: TrainOptions,
+    emit: Emit,
+    cancelled: Callable[[], bool],
+    **more: Any,
+) -> Any:
+    """Do the units of a scene in tiles, and record what becomes of them."""
+    name = workdir.parent.name
+    units: list[str] = []
+
+    def recorded_unit(context: Context) -> None:
+        units.append(context.run.name)
+        record(name, "unit", unit=context.run.name)
+        run_unit(context)
+
+    others = more["others"]
+    stored = others.stored
+
+    def recorded_stored(output: Path) -> None:
+        stored(output)
+        record(name, "unit stored", unit=units[-1])
+
+    with patch.object(job, "run_unit", recorded_unit), patch.object(others, "stored", recorded_stored):
+        return _recorded(run_tiles, capture, workdir, options, emit, cancelled, **more)
+
+
+def _recorded(
+    work: Callable[..., Any],
+    capture: Path,
+    workdir: Path,
+    options: TrainOptions,
+    emit: Emit,
+    cancelled: Callable[[], bool],
+    **more: Any,
+) -> Any:
+    name = workdir.parent.name
     # The kernel releases this lock when the process ends, not before: if it is held, two attempts run at once.
-    alone = open(Path(os.environ["SOAK_TRACE"]).parent / f"{job}.lock", "w")  # noqa: SIM115
+    alone = open(Path(os.environ["SOAK_TRACE"]).parent / f"{name}.lock", "w")  # noqa: SIM115
     try:
         fcntl.flock(alone, fcntl.LOCK_EX | fcntl.LOCK_NB)
         overlap = False
     except BlockingIOError:
         overlap = True
-    record(job, "begin", overlap=overlap, published=_published(job))
+    record(name, "begin", overlap=overlap, published=_published(name))
     save, load = checkpoint.save, checkpoint.load
 
     def recorded_emit(event: Event) -> None:
-        record(job, "step", **_place(event))
+        record(name, "step", **_place(event))
         emit(event)
 
     def recorded_save(directory: Path, snapshot: Snapshot) -> None:
         save(directory, snapshot)
-        record(job, "stored", step=snapshot.state.step)
+        record(name, "stored", step=snapshot.state.step)
 
     def recorded_load(directory: Path) -> Snapshot | None:
         snapshot = load(directory)
-        record(job, "resume", step=0 if snapshot is None else snapshot.state.step)
+        record(name, "resume", step=0 if snapshot is None else snapshot.state.step)
         return snapshot
 
     with patch.multiple(checkpoint, save=recorded_save, load=recorded_load):
-        result = pipeline.run(capture, workdir, options, recorded_emit, cancelled, onlookers=onlookers)
+        result = work(capture, workdir, options, recorded_emit, cancelled, **more)
     if result.ended == "succeeded":
-        record(job, "end")
+        record(name, "end")
     return result
 
 
@@ -96,3 +142,6 @@ def _published(job: str) -> bool:
         return Storage(storage_url()).exists(layout.job_record(job))
     except StorageError:
         return False
+
+
+job.run = run_in_tiles

@@ -7,6 +7,7 @@ from _still_life import photos, posed_capture, video
 
 PHOTOS = 11
 WIDTH, HEIGHT = 160, 120
+TILES = 2
 _GAUSSIANS = 1000
 """Limit of Gaussians, for models of a quarter of a megabyte."""
 
@@ -34,23 +35,26 @@ KINDS = {
     "photos": f"SfM and training of {PHOTOS} photos",
     "video": f"frames, SfM and training of a video of {PHOTOS} frames",
     "cameras": f"training of {PHOTOS} photos with given cameras",
+    "tiles": f"SfM and training of {PHOTOS} photos in {TILES} tiles",
 }
 """What a job of each kind does."""
 
-_TURN = ("photos", "photos", "cameras", "photos", "video", "photos")
+_TURN = ("photos", "tiles", "cameras", "photos", "video", "photos", "tiles")
 
 
 def captures() -> dict[str, dict[str, bytes]]:
     """Return the files of a capture of each kind."""
+    several = photos(PHOTOS, WIDTH, HEIGHT)
     return {
-        "photos": photos(PHOTOS, WIDTH, HEIGHT),
+        "photos": several,
+        "tiles": several,
         "video": video(PHOTOS, WIDTH, HEIGHT),
         "cameras": posed_capture(PHOTOS, WIDTH, HEIGHT),
     }
 
 
 def nth(number: int, files: dict[str, dict[str, bytes]]) -> Work:
-    """Return the work of the job with this number. Every fourth one writes a film of its training.
+    """Return the work of the job with this number. Every fourth one in one piece writes a film of its training.
 
     files: those of a capture of each kind.
     """
@@ -58,6 +62,8 @@ def nth(number: int, files: dict[str, dict[str, bytes]]) -> Work:
     options = {
         "steps": _STEPS[(number + number // len(_TURN)) % len(_STEPS)],
         "max_gaussians": _GAUSSIANS,
-        "progress_video": "orbit" if number % 4 == 0 else "off",
+        **(
+            {"tiles": TILES} if kind == "tiles" else {"progress_video": "orbit" if number % 4 == 0 else "off"}
+        ),
     }
     return Work(kind, files[kind], PHOTOS, options)

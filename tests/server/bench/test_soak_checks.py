@@ -93,6 +93,9 @@ def test_steps_that_are_taken_again_are_found() -> None:
         "a was resumed from step 20 though step 30 was stored"
     ]
     assert attempts.repeated([*whole, stored(25)]) == ["a stored step 25 after step 30"]
+    tile = [line("unit", unit="tile-1"), line("unit stored", unit="tile-1")]
+    assert attempts.repeated([tile[0], *tile, line("unit", unit="tile-2")]) == []
+    assert attempts.repeated([*tile, tile[0]]) == ["process 7 did tile-1 of a again, which was stored"]
 
 
 def test_cameras_that_are_recovered_again_are_found() -> None:

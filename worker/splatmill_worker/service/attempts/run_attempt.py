@@ -274,8 +274,9 @@ def _train(
 
 def _pipeline(attempt: Attempt, load: LoadPipeline, row: JobRow, folder: JobFolder, room: Room) -> Pipeline:
     """What does the work of the job: of a scene in tiles, other workers do some."""
+    pipeline = load()
     if row.options.tiles is None:
-        return load()
+        return pipeline
     from splatmill_worker.service.units.other_workers import OtherWorkers
     from splatmill_worker.tiles import job
 
