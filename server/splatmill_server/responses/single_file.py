@@ -76,6 +76,7 @@ def single_file(
     view = shown.start_view
     options = {
         "cameras": specs[:: len(specs) // MOST_CAMERAS + 1],
+        "up": cameras.up,
         "antialias": antialias,
         "label": name,
         "background": shown.background,

@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatmill.schema import CameraSpec, ModelCamera, ModelCameras
+from splatmill.schema import CameraSpec, ModelCamera, ModelCameras, OrbitRequest
 from splatmill_worker.mesh import glb as mesh_glb
 from splatmill_worker.mesh.triangles import Mesh
 from splatmill_worker.render_service.convert import convert
 from splatmill_worker.render_service.world_up import up_beside, up_of
 from splatmill_worker.splat.formats import ply, registry
+from splatmill_worker.splat.orbit import orbit_cameras
 from tests.support.files.turned import shown
 from tests.support.gaussians import some_gaussians
 from tests.worker.mesh.test_triangles import chunks
@@ -89,3 +90,18 @@ def test_few_cameras_tell_nothing(tmp_path: Path) -> None:
     assert up_beside(tmp_path / "model.ply") is None
     (tmp_path / "cameras.json").write_text("[]")
     assert up_beside(tmp_path / "model.ply") is None
+
+
+def test_recovered_cameras_say_what_is_up_however_the_photos_were_held(tmp_path: Path) -> None:
+    # A flight that looks straight down: what is up in its photos is where it flies.
+    flight = cameras(Z_UP)
+    for number, row in enumerate(flight.cameras):
+        matrix = [[1, 0, 0, 0], [0, 0, 1, -9], [0, -1, 0, 8.0 * number], [0, 0, 0, 1]]
+        row.camera = row.camera.model_copy(update={"camera_to_world": matrix})
+    flight = flight.model_copy(update={"up": (0.0, -1.0, 0.0)})
+    assert up_of(flight) == (0.0, -1.0, 0.0)
+    (camera, *_) = orbit_cameras(
+        flight, some_gaussians(50, 0), OrbitRequest(seconds=0.5, fps=8, width=64, height=48)
+    )
+    assert camera.viewmat[1, 1] > 0.9, "what is lower in the world is lower in the picture"
+    assert camera.center[1] == pytest.approx(-9, abs=0.1), "the camera is as high as the flight"

@@ -167,6 +167,7 @@ def placement_of(scene: Scene, world: ExportWorld, held_out: Iterable[str]) -> P
         colors=scene.colors[chosen].tolist(),
         points_total=len(scene.points),
         unused=[UnusedPhoto(name=name, why=why) for name, why in scene.left_out],
+        up=world.up,
     )
 
 

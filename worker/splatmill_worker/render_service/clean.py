@@ -23,6 +23,7 @@ from splatmill_worker.images.load import load_views
 from splatmill_worker.render_service.edit import kept
 from splatmill_worker.render_service.encoding import camera_of
 from splatmill_worker.render_service.local import REFUSED, STOPPED, UNWRITABLE, read
+from splatmill_worker.render_service.place import place_beside
 from splatmill_worker.render_service.world_up import up_beside
 from splatmill_worker.scene import Normalization, Scene, View, split
 from splatmill_worker.sfm import posed
@@ -139,7 +140,12 @@ def clean_file(model: Path, out: Path, wanted: Wanted) -> Cleaned:
             f"Nothing would be left of the {whole.count:,} Gaussians. Choose a larger box or a smaller weight.",
         )
     cleaned.left = registry.write(
-        out, whole.select(keep), offset=contents.offset, antialiased=antialias, up=up_beside(model)
+        out,
+        whole.select(keep),
+        offset=contents.offset,
+        antialiased=antialias,
+        up=up_beside(model),
+        to_earth=place_beside(model),
     )
     return cleaned
 

@@ -15,6 +15,7 @@ from splatmill_worker.errors import ModelUnreadable
 from splatmill_worker.render_service.encoding import camera_of
 from splatmill_worker.render_service.local import REFUSED, STOPPED, UNWRITABLE, read
 from splatmill_worker.render_service.loss import Loss, Viewpoint, look, loss
+from splatmill_worker.render_service.place import place_beside
 from splatmill_worker.render_service.world_up import up_beside
 from splatmill_worker.splat.formats import registry
 from splatmill_worker.splat.gaussians import Gaussians
@@ -76,7 +77,12 @@ def convert(model: Path, outs: Sequence[Path], photos: Path | None) -> tuple[int
     converted = []
     for out in outs:
         count = registry.write(
-            out, gaussians, offset=contents.offset, antialiased=antialias, up=up_beside(model)
+            out,
+            gaussians,
+            offset=contents.offset,
+            antialiased=antialias,
+            up=up_beside(model),
+            to_earth=place_beside(model),
         )
         lost = None
         found = format_of(out.name)

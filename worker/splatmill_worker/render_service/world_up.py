@@ -22,10 +22,15 @@ FEWEST = 3
 def up_of(stored: ModelCameras | None) -> Up | None:
     """A unit vector up, in the world of a model with these cameras; None where it does not follow from them.
 
-    It is the axis of the world that is nearest to what is up for most of the photos. In a world that has none, as that
-    of a COLMAP model, it is that direction itself, if nothing speaks against it.
+    It is what they say, as those of recovered cameras do. Otherwise it is the axis of the world that is nearest to what
+    is up for most of the photos. In a world that has none, as that of a COLMAP model, it is that direction itself, if
+    nothing speaks against it.
     """
-    if stored is None or len(stored.cameras) < FEWEST:
+    if stored is None:
+        return None
+    if stored.up is not None:
+        return stored.up
+    if len(stored.cameras) < FEWEST:
         return None
     rotations = np.stack([camera_of(row.camera).viewmat[:3, :3] for row in stored.cameras])
     down = down_of(rotations)

@@ -72,14 +72,14 @@ class OrbitPath:
         return viewmat_of(np.stack([right, np.cross(forward, right), forward]), eye)
 
 
-def fit_path(centers: Float, forwards: Float, ups: Float) -> OrbitPath:
-    """Return the path that fits cameras: their positions, viewing directions and upward directions, [N,3] each.
+def fit_path(centers: Float, forwards: Float, ups: Float, target: Float | None = None) -> OrbitPath:
+    """Return the path that fits cameras: their positions [N,3], viewing directions [N,3] and upward directions [M,3].
 
-    The target is the point nearest to all optical axes (least squares). Where these are almost parallel, or meet behind
-    the cameras, it lies in front of the cameras' mean position, at three times their mean distance from there.
+    target: [3]; None: the point nearest to all optical axes (least squares). Where these are almost parallel, or meet
+    behind the cameras, it lies in front of the cameras' mean position, at three times their mean distance from there.
     """
     up = _unit(ups.mean(axis=0), np.array([0.0, 0.0, 1.0]))
-    target = _nearest_to_axes(centers, forwards)
+    target = _nearest_to_axes(centers, forwards) if target is None else target
     offsets = centers - target
     heights = offsets @ up
     flat = offsets - heights[:, None] * up
@@ -153,7 +153,11 @@ def orbit_cameras(
     if stored is None or len(stored.cameras) < 2:
         return cameras_along(path_of(gaussians, up), request, request.fov_y_deg or DEFAULT_FOV)
     poses = np.array([camera.camera.opencv_to_world() for camera in stored.cameras])
-    path = fit_path(poses[:, :3, 3], poses[:, :3, 2], -poses[:, :3, 1])
+    centers, forwards = poses[:, :3, 3], poses[:, :3, 2]
+    if stored.up is None:
+        path = fit_path(centers, forwards, -poses[:, :3, 1])
+    else:
+        path = fit_path(centers, forwards, np.array([stored.up]), np.zeros(3))
     return cameras_along(path, request, request.fov_y_deg or _field_of_view(stored, request))
 
 

@@ -127,7 +127,17 @@ MODEL_FORMATS: dict[str, ModelFormat] = {
             readable=True,
             writable=True,
             loses="Nothing, as every parameter is stored as float32.",
-            readers=("PlayCanvas", "CesiumJS", "Babylon.js"),
+            readers=("PlayCanvas", "Babylon.js"),
+        ),
+        ModelFormat(
+            "tileset.json",
+            "3D Tiles 1.1: levels of detail at their place on the earth, in a folder beside the tileset.json",
+            "application/json",
+            readable=False,
+            writable=True,
+            loses="What .spz loses, and the far surroundings of the scene.",
+            readers=("CesiumJS",),
+            folder=True,
         ),
     )
 }

@@ -18,10 +18,11 @@ const SOON = 1000;
  * @param {number} model.gaussians how many it has
  * @param {{name: string}[]} model.files
  * @param {any[]} model.cameras those of the photos
+ * @param {any} model.up what is up, as /v1/models/ID/cameras says it
  * @param {import("./viewer/presented.js").Presentation} model.presentation how its owner wants it to be shown
  * @param {import("./viewer.js").Options} options others than those for the source and the cameras
  */
-export function openModel(box, { address, gaussians, files, cameras, presentation }, options) {
+export function openModel(box, { address, gaussians, files, cameras, up, presentation }, options) {
   // The worker takes the picture from where the first held-out photo was taken, or else the first photo of all.
   const first = (cameras.find(({ split }) => split === "test") ?? cameras[0])?.camera;
   const picture = pictureOf(files);
@@ -33,6 +34,7 @@ export function openModel(box, { address, gaussians, files, cameras, presentatio
     ...options,
     model: address,
     cameras: cameras.map(({ camera }) => camera),
+    up,
     camera,
     poster,
     whole: { ...wholeFile(address), what: "the whole model, which edits are shown on; the server makes its file once" },

@@ -50,6 +50,7 @@ const TURN_MS = 350;
  * @property {string} [model]  address of a stored model, as /v1/models/{id}: the server renders it where there is no WebGL
  * @property {Camera[]} [cameras]  of the photos: they tell where up is, where to look, and how far away to be. Without
  *   any, -y is up, and the dense middle of the Gaussians is seen from the side
+ * @property {import("./viewer/pose.js").Vec | null} [up]  what is up, where that is known better than by `cameras`
  * @property {Camera} [camera]  to start from, exactly; left out, upright from the side of one of `cameras` whose view is
  *   close to the middle of all
  * @property {string} [poster]  address of a picture as `camera` sees it, shown until the model is drawn
@@ -164,11 +165,11 @@ export class View extends EventTarget {
     }
   }
 
-  /** Take over where the scene is from the cameras of its photos, and look at it unless somebody has moved the camera. @param {Camera[]} cameras */
-  surround(cameras) {
+  /** Take over where the scene is from the cameras of its photos, and look at it unless somebody has moved the camera. @param {Camera[]} cameras @param {Options["up"]} [up] */
+  surround(cameras, up = this.options.up) {
     const { pose, distance, tangents, home } = this;
-    const { up, focus, middle, spread } = surroundings(cameras);
-    [this.up, this.focus, this.middle] = [up, focus, middle];
+    const { focus, middle, spread, ...its } = surroundings(cameras, up);
+    [this.up, this.focus, this.middle] = [its.up, focus, middle];
     this.spread = spread || length(sub(focus, middle)) || 1;
     this.limit = this.options.roam ? { center: middle, radius: this.options.roam * this.spread } : null;
     this.overlay.size = FRUSTUM * this.spread;

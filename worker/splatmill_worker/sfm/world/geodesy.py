@@ -31,6 +31,13 @@ def earth_centered(places: Float) -> Float:
     )
 
 
+def to_earth_centered(origin: Float) -> Float:
+    """Matrix [4,4] from metres east, north and up of a place [3] to metres from the earth's centre."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = _axes(origin).T, earth_centered(origin[None])[0]
+    return matrix
+
+
 def local(places: Float, origin: Float) -> Float:
     """Metres [n,3] to the east, to the north and upwards of `origin` [3], of places [n,3] as in `earth_centered`."""
     offsets: Float = (earth_centered(places) - earth_centered(origin[None])) @ _axes(origin).T

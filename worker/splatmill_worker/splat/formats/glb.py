@@ -34,6 +34,14 @@ from splatmill_worker.splat.gaussians import SH_C0, Gaussians
 from splatmill_worker.wording import plain
 
 EXTENSION = "KHR_gaussian_splatting"
+DRAWN = {
+    "kernel": "ellipse",
+    "colorSpace": "srgb_rec709_display",
+    "projection": "perspective",
+    "sortingMethod": "cameraDistance",
+}
+"""How the Gaussians of a primitive are drawn, in the words of the extension."""
+
 MAX_JSON_BYTES = 2**22
 """Bytes of the document, which has some ten kilobytes; Python takes up to thirty times as many to parse it."""
 
@@ -65,18 +73,12 @@ def write(
         f"{EXTENSION}:SCALE": parts.add(turned.log_scales.exp().numpy()),
         f"{EXTENSION}:OPACITY": parts.add(torch.sigmoid(turned.logit_opacities)[:, None].numpy()),
     }
-    for index, (degree, order) in enumerate(_harmonics(turned.degree)):
+    for index, (degree, order) in enumerate(harmonics(turned.degree)):
         attributes[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{order}"] = parts.add(turned.sh[:, index].numpy())
-    extension = {
-        "kernel": "ellipse",
-        "colorSpace": "srgb_rec709_display",
-        "projection": "perspective",
-        "sortingMethod": "cameraDistance",
-    }
     primitive = {
         "mode": _POINTS,
         "attributes": attributes,
-        "extensions": {EXTENSION: extension},
+        "extensions": {EXTENSION: DRAWN},
         "extras": {"antialiased": antialiased} | ({"offset": offset} if any(offset) else {}),
     }
     document: dict[str, Any] = {
@@ -118,7 +120,7 @@ def read(path: Path) -> Contents:
         ) from error
 
 
-def _harmonics(degree: int) -> Iterator[tuple[int, int]]:
+def harmonics(degree: int) -> Iterator[tuple[int, int]]:
     """Degree of each coefficient in the order of the `.ply`, and its place within it, from the lowest order up."""
     for each in range(degree + 1):
         for order in range(2 * each + 1):
@@ -156,7 +158,7 @@ def _contents(path: Path) -> Contents:
     def values(name: str, width: int) -> Tensor:
         return _accessor(document, data, attributes[name], width, name, count)
 
-    sh = [values(f"{EXTENSION}:SH_DEGREE_{d}_COEF_{order}", 3) for d, order in _harmonics(degree)]
+    sh = [values(f"{EXTENSION}:SH_DEGREE_{d}_COEF_{order}", 3) for d, order in harmonics(degree)]
     scales = values(f"{EXTENSION}:SCALE", 3)
     if bool((scales < 0).any()):
         raise ValueError(

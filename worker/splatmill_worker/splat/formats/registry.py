@@ -7,6 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
+import numpy as np
+import numpy.typing as npt
+
 from splatmill.schema.files.formats import MODEL_FORMATS, format_of
 from splatmill_worker.errors import ModelUnreadable
 from splatmill_worker.splat.formats import (
@@ -20,6 +23,7 @@ from splatmill_worker.splat.formats import (
     spz,
     streamed_sog,
     streamed_zip,
+    tileset,
 )
 from splatmill_worker.splat.formats.contents import NO_OFFSET, Contents, Offset
 from splatmill_worker.splat.gaussians import Gaussians
@@ -64,8 +68,16 @@ CODECS: dict[str, Codec] = {
     "lod-meta.json": Codec(streamed_sog.read, streamed_sog.write),
     ".lod.zip": Codec(streamed_zip.read, streamed_zip.write),
     ".glb": Codec(glb.read, glb.write),
+    "tileset.json": Codec(None, tileset.write),
 }
 """One for each of `MODEL_FORMATS`; a test compares them."""
+
+
+FOLDERS: dict[str, Callable[[Path], list[Path]]] = {
+    "lod-meta.json": streamed_sog.files,
+    "tileset.json": tileset.files,
+}
+"""By the name of the index, the files of a model that was written to a folder."""
 
 
 def reader(path: Path) -> Reader:
@@ -102,8 +114,8 @@ def read(path: Path) -> Contents:
 
 def size(path: Path) -> int:
     """The bytes of a model that was written to `path`, those of the files beside it included."""
-    found = format_of(path.name)
-    parts = streamed_sog.files(path) if found is not None and found.folder else [path]
+    folder = FOLDERS.get(path.name.lower())
+    parts = [path] if folder is None else folder(path)
     return sum(part.stat().st_size for part in parts)
 
 
@@ -114,12 +126,14 @@ def write(
     offset: Offset = NO_OFFSET,
     antialiased: bool = False,
     up: gltf.Up | None = None,
+    to_earth: npt.NDArray[np.float64] | None = None,
 ) -> int:
     """Write Gaussians to a file whose suffix names the format, and return how many it holds.
 
     gaussians: in the frame of the standard .ply, of any dtype and on any device.
     offset, antialiased: as in `Contents`, stored where the format has a place for them.
-    up: a unit vector, by which a `.glb` is shown upright; None where it is not known, and -y is taken.
+    up: a unit vector, by which a `.glb` or a tileset is shown upright; None where it is not known, and -y is taken.
+    to_earth: the place of a tileset, as of `tileset.write`.
 
     Rows with a non-finite parameter and rows with an opacity under MIN_OPACITY are left out. The file is replaced
     atomically. Raises ModelUnreadable for a suffix that is not written, and OSError.
@@ -127,4 +141,8 @@ def write(
     function = writer(path)
     if function is glb.write:
         return glb.write(path, gaussians, offset=offset, antialiased=antialiased, up=up)
+    if function is tileset.write:
+        return tileset.write(
+            path, gaussians, offset=offset, antialiased=antialiased, up=up, to_earth=to_earth
+        )
     return function(path, gaussians, offset=offset, antialiased=antialiased)

@@ -78,6 +78,12 @@ def write(
     file. The file is replaced atomically. Raises OSError.
     """
     gaussians = visible(gaussians)
+    atomic_write(path, encoded(gaussians, antialiased=antialiased, sh_bits=sh_bits))
+    return gaussians.count
+
+
+def encoded(gaussians: Gaussians, *, antialiased: bool = False, sh_bits: int = SH_BITS) -> bytes:
+    """The file of `gaussians`, all of which are finite, as `write` writes it."""
     gaussians = turned_about_x(gaussians.select(morton_order(gaussians.means)))
     bits = _fraction_bits(gaussians)
     fixed = (gaussians.means.double() * 2**bits).round().clamp(-(2**23), 2**23 - 1).to(torch.int32)
@@ -94,8 +100,7 @@ def write(
     )
     packer = zlib.compressobj(wbits=31)
     pieces = [packer.compress(head), *(packer.compress(s.tobytes()) for s in streams), packer.flush()]
-    atomic_write(path, b"".join(pieces))
-    return gaussians.count
+    return b"".join(pieces)
 
 
 def read(path: Path) -> Contents:

@@ -7,22 +7,20 @@ surroundings of a scene are its `environment`, which stands outside of the tree,
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from splatmill.files import atomic_write
 from splatmill_worker.errors import ModelUnreadable
 from splatmill_worker.splat.formats import sog
 from splatmill_worker.splat.formats.contents import NO_OFFSET, Contents, Offset, visible
 from splatmill_worker.splat.gaussians import Gaussians, concatenate
+from splatmill_worker.splat.lod.boxes import leaf_boxes
 from splatmill_worker.splat.lod.levels import Level, Levels, make_levels
-from splatmill_worker.splat.lod.moments import extents
 from splatmill_worker.splat.lod.partition import Node
 from splatmill_worker.wording import plain
 
@@ -34,9 +32,6 @@ CHUNK = 65536
 INDEX = "lod-meta.json"
 
 ENVIRONMENT = "env/meta.json"
-
-REACH = math.sqrt(2 * math.log(255))
-"""Standard deviations at which an opaque Gaussian falls under an opacity of 1/255, up to which a leaf's box goes."""
 
 MAX_INDEX_BYTES = 2**23
 """Bytes of a `lod-meta.json`, of which a leaf takes some 400; Python takes up to thirty times as many to parse it."""
@@ -183,7 +178,7 @@ def _tree(levels: Levels, chunks: list[Chunk]) -> dict[str, Any]:
             }
             leaves[leaf]["lods"][str(chunk.level)] = place
             leaves[leaf]["errors"].append(_short(levels.levels[chunk.level].errors[leaf]))
-    boxes = _boxes(levels)
+    boxes = leaf_boxes(levels)
 
     def built(node: Node) -> dict[str, Any]:
         low = boxes[0, node.first : node.last].amin(0)
@@ -194,21 +189,6 @@ def _tree(levels: Levels, chunks: list[Chunk]) -> dict[str, Any]:
         return {"bound": bound, "children": [built(child) for child in node.children]}
 
     return built(levels.tree)
-
-
-def _boxes(levels: Levels) -> Tensor:
-    """The lower and upper corners of the leaves [2, leaves, 3], of all their levels."""
-    count = len(levels.levels[0].runs)
-    low = torch.full((count, 3), torch.inf, dtype=torch.float64)
-    high = -low
-    for level in levels.levels:
-        leaf = torch.repeat_interleave(torch.arange(count), torch.tensor([run.count for run in level.runs]))
-        means, reach = level.gaussians.means.double(), REACH * extents(level.gaussians)
-        index = leaf[:, None].expand(-1, 3)
-        low.scatter_reduce_(0, index, means - reach, "amin")
-        high.scatter_reduce_(0, index, means + reach, "amax")
-    empty = low > high
-    return torch.stack([low.masked_fill(empty, 0), high.masked_fill(empty, 0)])
 
 
 def _short(number: float) -> float:

@@ -50,6 +50,11 @@ class ExportWorld:
         far = float(np.linalg.norm(middle)) * normalization.scale > FAR
         return ExportWorld(normalization, np.round(middle) if far else np.zeros(3), scene.frame)
 
+    @property
+    def up(self) -> tuple[float, float, float] | None:
+        """What points up; None where nothing but how the photos were held says so. In a chosen frame, y points down."""
+        return None if self.frame is None else (0.0, -1.0, 0.0)
+
     def camera(self, camera: Camera) -> Camera:
         """A camera of the training world in this world."""
         original = self.normalization.undo_camera(camera)
@@ -105,7 +110,7 @@ def export(
         for view in views
         for score in [scores.get(view.name)]
     ]
-    document = ModelCameras(cameras=cameras).model_dump(mode="json", exclude_none=True)
+    document = ModelCameras(cameras=cameras, up=world.up).model_dump(mode="json", exclude_none=True)
     atomic_write(out / "cameras.json", json.dumps(document, indent=1))
     if world.frame is not None:
         atomic_write(out / "frame.json", world.frame.model_dump_json(indent=1))

@@ -46,6 +46,9 @@ class Placement(Response):
     unused: list[UnusedPhoto] = Field(
         default_factory=list, description="The photos that are not used; empty until it is final."
     )
+    up: tuple[float, float, float] | None = Field(
+        default=None, description="What is up, as in the cameras of the model; null until it is final."
+    )
 
 
 class Watch(Response):

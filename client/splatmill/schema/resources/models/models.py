@@ -79,6 +79,11 @@ class ModelCameras(Response):
     """The response of `/v1/models/{id}/cameras`, and the contents of cameras.json."""
 
     cameras: list[ModelCamera]
+    up: tuple[float, float, float] | None = Field(
+        default=None,
+        description="Unit vector that points up in the coordinates of the model, whose origin is what the cameras look "
+        "at; null where the coordinates came with the photos, which then say neither.",
+    )
 
 
 class StageSeconds(Response):

@@ -12,6 +12,7 @@ import { sameWorld } from "./same_world.js";
  * @typedef {object} Side a model of the page
  * @property {any} model
  * @property {any[]} cameras of its photos
+ * @property {any} up what is up, as `/v1/models/{id}/cameras` says it
  * @property {any} presentation
  * @property {string} address
  */
@@ -30,7 +31,7 @@ try {
 async function load(address) {
   const [model, presentation] = await Promise.all([get(address), get(`${address}/presentation`)]);
   const has = model.files.some((/** @type {any} */ file) => file.name === "cameras.json");
-  return { model, address, presentation, cameras: has ? (await get(`${address}/cameras`)).cameras : [] };
+  return { model, address, presentation, ...(has ? await get(`${address}/cameras`) : { cameras: [], up: null }) };
 }
 
 /** @param {Side[]} sides */

@@ -118,7 +118,7 @@ export class LiveScene {
   surround() {
     if (!this.view || this.surrounded || !this.cameras.length) return;
     this.surrounded = true;
-    this.view.surround(this.cameras.map(({ camera }) => camera));
+    this.view.surround(this.cameras.map(({ camera }) => camera), this.placement?.up);
   }
 
   showPlacement() {
@@ -189,7 +189,7 @@ export class LiveScene {
     } else {
       this.boxes.scene.hidden = false; // the viewer takes its size from the box
       const cameras = this.cameras.map(({ camera }) => camera);
-      this.view = await open(this.boxes.scene, { ...source, cameras, label: "The scene in training" });
+      this.view = await open(this.boxes.scene, { ...source, cameras, up: this.placement?.up, label: "The scene in training" });
       this.surrounded = cameras.length > 0;
       this.surround();
       this.surrounded = this.cameras.length > 0;

@@ -67,15 +67,15 @@ export class PlacementView {
     };
     this.overlay.cameras = cameras;
     const specs = cameras.map(({ camera }) => camera);
-    if (specs.length) this.settle(specs);
+    if (specs.length) this.settle(specs, placement.up);
     this.element.setAttribute("aria-label", `${cameras.length} cameras and ${placement.points_total} points. ${help()}`);
     this.element.dataset.cameras = String(cameras.length);
     this.again();
   }
 
-  /** Take over where the scene is now. @param {Camera[]} cameras */
-  settle(cameras) {
-    const { up, focus } = surroundings(cameras);
+  /** Take over where the scene is now. @param {Camera[]} cameras @param {any} known  what is up, where that is known */
+  settle(cameras, known) {
+    const { up, focus } = surroundings(cameras, known);
     const spread = Math.max(...cameras.map((camera) => length(sub(poseOf(camera).position, focus)))) || 1;
     if (this.moved && this.spread > 0) {
       // A mapper may have scaled its world meanwhile.

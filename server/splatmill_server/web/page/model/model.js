@@ -23,6 +23,7 @@ import { confirmAction, noticeOf, startShell } from "../shell.js";
  * @property {any} model the answer of `/v1/models/{id}`
  * @property {string} address that of the model, as `/v1/models/{id}`
  * @property {any[]} cameras those of the photos, with `name`, `split`, `camera`, `psnr`, `ssim` and `photo`; none if it has none
+ * @property {any} up what is up, as `/v1/models/{id}/cameras` says it
  * @property {any} report the contents of report.json; `{}` if it has none
  * @property {import("../viewer/presented.js").Presentation} presentation how it is shown to people
  * @property {"black" | "white"} background the colour behind the model when it was measured
@@ -40,14 +41,14 @@ try {
 async function load(address) {
   const model = await get(address);
   const has = new Set(model.files.map((/** @type {any} */ file) => file.name));
-  const [presentation, cameras, report] = await Promise.all([
+  const [presentation, { cameras, up }, report] = await Promise.all([
     get(`${address}/presentation`),
-    has.has("cameras.json") ? get(`${address}/cameras`).then((found) => found.cameras) : [],
+    has.has("cameras.json") ? get(`${address}/cameras`) : { cameras: [], up: null },
     has.has("report.json") ? get(`${address}/files/report.json`).catch(() => ({})) : /** @type {any} */ ({}),
   ]);
   const chosen = report.plan?.background ?? "random";
   const white = chosen === "white" || (chosen === "random" && report.facts?.transparent > 0);
-  return { model, address, cameras, report, presentation, background: white ? "white" : "black" };
+  return { model, address, cameras, up, report, presentation, background: white ? "white" : "black" };
 }
 
 /** @param {Shown} shown */

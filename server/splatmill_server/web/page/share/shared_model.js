@@ -35,10 +35,10 @@ export async function showShared() {
 async function view(box, model, name) {
   try {
     const has = model.files.some((/** @type {any} */ file) => file.name === "cameras.json");
-    const [{ cameras }, presentation, { openModel }, { present }] = await Promise.all([
+    const [{ cameras, up }, presentation, { openModel }, { present }] = await Promise.all([
       has ? get(`${address}/cameras`) : { cameras: [] }, get(`${address}/presentation`), import("../opening.js"), import("../viewer/presented.js"),
     ]);
-    const shown = { address, gaussians: model.gaussians, files: model.files, cameras, presentation };
+    const shown = { address, gaussians: model.gaussians, files: model.files, cameras, up, presentation };
     present(box, await openModel(box, shown, { antialias: model.antialias, label: name }), presentation, name);
   } catch (error) {
     // The picture of the model, which the page came with, stays.

@@ -140,22 +140,25 @@ export function projected(pose, point, focal, width, height) {
 /**
  * What the cameras of the photos tell about a scene.
  *
- * up: the mean of the directions that are up in the photos.
- * focus: the point nearest to all optical axes (least squares); where these are almost parallel, or meet behind the
- *   cameras, a point in front of the cameras' mean position.
+ * up: what is known to be up, or the mean of the directions that are up in the photos.
+ * focus: the origin where up is known, which it then is; else the point nearest to all optical axes (least squares), or
+ *   where these are almost parallel, or meet behind the cameras, a point in front of the cameras' mean position.
  * middle: the mean position.
  * spread: the distance of the farthest camera from it.
  *
  * @param {Camera[]} cameras  at least one
+ * @param {Vec | null} [known]
  */
-export function surroundings(cameras) {
+export function surroundings(cameras, known) {
   const poses = cameras.map(poseOf);
   const middle = mean(poses.map((pose) => pose.position));
   const ahead = unit(mean(poses.map((pose) => pose.forward)), poses[0].forward);
   const distances = poses.map((pose) => length(sub(pose.position, middle)));
   const spread = Math.max(...distances);
-  const focus = nearestToAxes(poses) ?? add(middle, times(ahead, 3 * (spread || 1)));
-  return { up: unit(times(mean(poses.map((pose) => pose.down)), -1), [0, -1, 0]), focus, middle, spread };
+  /** @type {Vec} */
+  const focus = known ? [0, 0, 0] : nearestToAxes(poses) ?? add(middle, times(ahead, 3 * (spread || 1)));
+  const up = known ?? unit(times(mean(poses.map((pose) => pose.down)), -1), [0, -1, 0]);
+  return { up, focus, middle, spread };
 }
 
 /** Radius of the dense middle, in median distances from its centre: far shells lie outside of it. */
