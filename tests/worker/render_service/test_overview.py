@@ -67,7 +67,9 @@ def test_one_point_is_framed() -> None:
     assert (path.target.tolist(), path.radius) == (CENTRE.tolist(), 2.5)
 
 
-@pytest.mark.parametrize("suffix", [suffix for suffix, form in MODEL_FORMATS.items() if form.writable])
+@pytest.mark.parametrize(
+    "suffix", [suffix for suffix, form in MODEL_FORMATS.items() if form.writable and form.readable]
+)
 def test_the_top_is_at_the_top_in_every_format(tmp_path: Path, suffix: str) -> None:
     """y points down in the frame of the `.ply`, so the red half lies above the blue one."""
     count = 600

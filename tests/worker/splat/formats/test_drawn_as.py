@@ -31,7 +31,7 @@ from splatmill_worker.splat.start import given_file
 from tests.support.ball import BALL, store_ball
 from tests.support.gaussians import some_gaussians
 
-WRITTEN = [suffix for suffix, form in MODEL_FORMATS.items() if form.writable]
+WRITTEN = [suffix for suffix, form in MODEL_FORMATS.items() if form.writable and form.readable]
 BOX = EditModel.model_validate({"box": {"min": [-9, -9, -9], "max": [9, 9, 9]}})
 
 
