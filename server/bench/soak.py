@@ -18,10 +18,10 @@ Within 30 s of a fault's end the service answers, takes a capture and shows a mo
 or ended, and no process has lost its parent (`_soak/recovery.py`). One fault in four is followed by the
 next at once instead, after which the jobs of both must get on. At the end every job that was accepted has its model, of
 all its photos, or its cancellation, no two attempts at a job ran at once, no step whose checkpoint was stored was taken
-again, no cameras that were stored were recovered again, no unit of a scene in tiles that was stored was done again, no
-pipeline ran for a model that was stored, no process is left, every file in storage is whole and explained by a record,
-and Redis, storage and the API's lists agree on every capture, job and model (`_soak/verdict.py`). Otherwise the exit
-status is 1, with a sentence for each thing that does not hold.
+again, no cameras that were stored were recovered again, no attempt did a unit of a scene in tiles again that it or an
+earlier one had stored, no pipeline ran for a model that was stored, no process is left, every file in storage is whole
+and explained by a record, and Redis, storage and the API's lists agree on every capture, job and model
+(`_soak/verdict.py`). Otherwise the exit status is 1, with a sentence for each thing that does not hold.
 
 Rows go to results/soak.jsonl, the table to soak.md. A seed fixes the faults and their order, not the moments at which
 the machine does what.
@@ -266,7 +266,7 @@ def _storage_part(storage: str, rows: list[Row], names: list[str]) -> list[str]:
         text += ["**What did not hold:**", "", *(f"- {complaint}" for complaint in end["complaints"]), ""]
     else:
         in_tiles = work.KINDS["tiles"] in end["kinds"]
-        units = ", no stored unit of a scene in tiles was done again" if in_tiles else ""
+        units = ", no attempt did a stored unit of a scene in tiles again" if in_tiles else ""
         text += [
             f"Within {RESUME_SECONDS * end['patience']:g} s of every fault that no other followed at once, the service "
             "answered, took a capture and showed a model, and every job that had begun had got on or ended. Nothing "

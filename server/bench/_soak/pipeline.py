@@ -1,7 +1,7 @@
 """The engine's pipeline in the jobs of a soak, with every begin, event, checkpoint and end on record.
 
 It runs in the attempt's process (SPLATMILL_PIPELINE) and changes nothing of what the pipeline does. For a scene in
-tiles, it puts its own function in the place of `tiles.job.run`. The record is one file of all attempts, SOAK_TRACE,
+tiles, it replaces `tiles.job.run` by a function of its own. The record is one file of all attempts, SOAK_TRACE,
 with a JSON line for each of
 
     begin: the process, the job, whether another attempt at the job runs beside it (`overlap`), and whether its model is
@@ -9,7 +9,8 @@ with a JSON line for each of
     step: an event of the engine, with its `stage` and its `step` of the training where it has them;
     stored: the checkpoint of a step is stored;
     resume: training begins, behind the `step` of the checkpoint that was read, or 0;
-    unit, unit stored: a `unit` of a scene in tiles begins, and its output is in storage;
+    unit, unit stored: an attempt begins a `unit` of a scene in tiles, and has its output in storage. Tiles that a
+        worker takes from the queue are not on record;
     end: the pipeline has returned with a whole model.
 
 Times are those of the machine's monotonic clock, which all processes share and no fault of a soak sets.
@@ -60,10 +61,8 @@ def run_in_tiles(
 ) -> Any:
     """Do the units of a scene in tiles, and record what becomes of them."""
     name = workdir.parent.name
-    units: list[str] = []
 
     def recorded_unit(context: Context) -> None:
-        units.append(context.run.name)
         record(name, "unit", unit=context.run.name)
         run_unit(context)
 
@@ -72,7 +71,7 @@ def run_in_tiles(
 
     def recorded_stored(output: Path) -> None:
         stored(output)
-        record(name, "unit stored", unit=units[-1])
+        record(name, "unit stored", unit=output.name.rpartition("-")[0])  # NAME-DIGEST
 
     with patch.object(job, "run_unit", recorded_unit), patch.object(others, "stored", recorded_stored):
         return _recorded(run_tiles, capture, workdir, options, emit, cancelled, **more)

@@ -17,6 +17,7 @@ from splatmill_worker.film import Film, with_even_sides
 from splatmill_worker.images.guarded import own_picture
 from splatmill_worker.splat.orbit import OrbitPath, fit_path
 from splatmill_worker.splat.plan.plan import Plan
+from splatmill_worker.splat.report.export import ExportWorld
 from splatmill_worker.splat.train.renderer import evaluation_background, renderer
 from splatmill_worker.splat.train.run import TrainingRun
 from splatmill_worker.splat.views import Target, TrainingView
@@ -109,13 +110,14 @@ class ProgressFilm:
         return True
 
 
-def orbit_of(views: Sequence[TrainingView]) -> OrbitPath:
-    """The path of a film around what the photos of a scene show, in its training world."""
+def orbit_of(views: Sequence[TrainingView], world: ExportWorld) -> OrbitPath:
+    """The path of a film around what the photos of a scene show, in its training world: that of the model's orbit."""
     cameras = [view.full.camera for view in views]
     return fit_path(
         np.array([camera.center for camera in cameras]),
         np.array([camera.axis for camera in cameras]),
         np.array([-camera.viewmat[1, :3] for camera in cameras]),
+        **({} if world.up is None else {"up": np.array(world.up), "focus": world.normalization.translation}),
     )
 
 

@@ -70,7 +70,7 @@ def _recording(job: Job, cameras: Cameras, photos: Photos, plan: Plan, *, anew: 
     if job.options.progress_video is not ProgressVideo.off:
         path = None
         if job.options.progress_video is ProgressVideo.orbit:
-            path = orbit_of([*photos.training, *photos.held_out])
+            path = orbit_of([*photos.training, *photos.held_out], cameras.exported)
         film = ProgressFilm(job.workdir / "film", photos.shown, plan, path, anew=anew)
     if job.keeps_time_lapse:
         folder = job.workdir / TIME_LAPSE

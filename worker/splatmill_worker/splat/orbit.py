@@ -72,14 +72,19 @@ class OrbitPath:
         return viewmat_of(np.stack([right, np.cross(forward, right), forward]), eye)
 
 
-def fit_path(centers: Float, forwards: Float, ups: Float, target: Float | None = None) -> OrbitPath:
-    """Return the path that fits cameras: their positions [N,3], viewing directions [N,3] and upward directions [M,3].
+def fit_path(
+    centers: Float, forwards: Float, ups: Float, *, up: Float | None = None, focus: Float | None = None
+) -> OrbitPath:
+    """Return the path that fits cameras: their positions, viewing directions and upward directions, [N,3] each.
 
-    target: [3]; None: the point nearest to all optical axes (least squares). Where these are almost parallel, or meet
-    behind the cameras, it lies in front of the cameras' mean position, at three times their mean distance from there.
+    up: what is known to be up, [3]; None: the mean of `ups`.
+    focus: what the cameras look at, [3]: the target if it is ahead of most of them. Otherwise, and for None, the target
+    is the point nearest to all optical axes (least squares). Where these are almost parallel, or meet behind the
+    cameras, it lies in front of the cameras' mean position, at three times their mean distance from there.
     """
-    up = _unit(ups.mean(axis=0), np.array([0.0, 0.0, 1.0]))
-    target = _nearest_to_axes(centers, forwards) if target is None else target
+    up = _unit(ups.mean(axis=0), np.array([0.0, 0.0, 1.0])) if up is None else up
+    known = focus is not None and _ahead(focus, centers, forwards)
+    target = focus if known and focus is not None else _nearest_to_axes(centers, forwards)
     offsets = centers - target
     heights = offsets @ up
     flat = offsets - heights[:, None] * up
@@ -154,10 +159,8 @@ def orbit_cameras(
         return cameras_along(path_of(gaussians, up), request, request.fov_y_deg or DEFAULT_FOV)
     poses = np.array([camera.camera.opencv_to_world() for camera in stored.cameras])
     centers, forwards = poses[:, :3, 3], poses[:, :3, 2]
-    if stored.up is None:
-        path = fit_path(centers, forwards, -poses[:, :3, 1])
-    else:
-        path = fit_path(centers, forwards, np.array([stored.up]), np.zeros(3))
+    known = {} if stored.up is None else {"up": np.array(stored.up), "focus": np.zeros(3)}
+    path = fit_path(centers, forwards, -poses[:, :3, 1], **known)
     return cameras_along(path, request, request.fov_y_deg or _field_of_view(stored, request))
 
 
@@ -168,16 +171,25 @@ def _quantile(values: Float, weights: Float, share: float) -> float:
     return float(values[order[min(np.searchsorted(sums, share * sums[-1]), len(order) - 1)]])
 
 
+def _ahead(point: Float, centers: Float, forwards: Float) -> bool:
+    """Whether a point lies ahead of most cameras, by more than a tenth of their mean distance from their mean."""
+    depths = np.einsum("nj,nj->n", point - centers, forwards)
+    return float(np.median(depths)) > 0.1 * _spread(centers)
+
+
+def _spread(centers: Float) -> float:
+    return float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).mean()) or 1.0
+
+
 def _nearest_to_axes(centers: Float, forwards: Float) -> Float:
-    spread = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).mean()) or 1.0
     alignment = np.linalg.eigvalsh(forwards.T @ forwards / len(forwards))[-1]  # 1 for parallel axes
     if alignment < 1.0 - 1e-3:
         nearest = looked_at(centers, forwards, ridge=0.0)
         # Axes that do not converge can have their nearest point behind the cameras.
-        if np.median(np.einsum("nj,nj->n", nearest - centers, forwards)) > 0.1 * spread:
+        if _ahead(nearest, centers, forwards):
             return nearest
     middle: Float = centers.mean(axis=0)
-    return middle + 3 * spread * _unit(forwards.mean(axis=0), forwards[0])
+    return middle + 3 * _spread(centers) * _unit(forwards.mean(axis=0), forwards[0])
 
 
 def _arc(azimuths: Float) -> tuple[float, float]:

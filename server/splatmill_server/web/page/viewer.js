@@ -36,6 +36,9 @@ const NEAR = 0.002;
 const FAR = 1e4;
 /** Depth of the drawn frusta, over the same distance. */
 const FRUSTUM = 0.07;
+/** Cosine of the angle to the vertical below which a view looks straight down or up. */
+const STEEP = 0.97;
+
 /** Milliseconds in which the view turns to a point that was double-clicked. */
 const TURN_MS = 350;
 
@@ -50,7 +53,8 @@ const TURN_MS = 350;
  * @property {string} [model]  address of a stored model, as /v1/models/{id}: the server renders it where there is no WebGL
  * @property {Camera[]} [cameras]  of the photos: they tell where up is, where to look, and how far away to be. Without
  *   any, -y is up, and the dense middle of the Gaussians is seen from the side
- * @property {import("./viewer/pose.js").Vec | null} [up]  what is up, where that is known better than by `cameras`
+ * @property {import("./viewer/pose.js").Vec | null} [up]  the upward direction where it is known, in a scene whose origin
+ *   is what `cameras` look at
  * @property {Camera} [camera]  to start from, exactly; left out, upright from the side of one of `cameras` whose view is
  *   close to the middle of all
  * @property {string} [poster]  address of a picture as `camera` sees it, shown until the model is drawn
@@ -134,6 +138,7 @@ export class View extends EventTarget {
     this.poster.alt = "";
     this.poster.addEventListener("error", () => this.poster.remove());
     /** What is being loaded, or why nothing is shown, in words. */
+    this.warning = "";
     this.said = document.createElement("p");
     this.said.className = "said";
     this.said.setAttribute("role", "status");
@@ -168,8 +173,8 @@ export class View extends EventTarget {
   /** Take over where the scene is from the cameras of its photos, and look at it unless somebody has moved the camera. @param {Camera[]} cameras @param {Options["up"]} [up] */
   surround(cameras, up = this.options.up) {
     const { pose, distance, tangents, home } = this;
-    const { focus, middle, spread, ...its } = surroundings(cameras, up);
-    [this.up, this.focus, this.middle] = [its.up, focus, middle];
+    const { up: upward, focus, middle, spread } = surroundings(cameras, up);
+    [this.up, this.focus, this.middle] = [upward, focus, middle];
     this.spread = spread || length(sub(focus, middle)) || 1;
     this.limit = this.options.roam ? { center: middle, radius: this.options.roam * this.spread } : null;
     this.overlay.size = FRUSTUM * this.spread;
@@ -193,7 +198,7 @@ export class View extends EventTarget {
           background: options.background === "white" ? [1, 1, 1] : [0, 0, 0],
           again: () => this.again(),
           drawn: () => this.poster.remove(),
-          trouble: (message) => this.say(message),
+          trouble: (message) => this.warn(message),
         });
         const begun = Promise.allSettled([engine, options.poster ? this.poster.decode() : null]);
         source = options.find?.((text) => this.say(text), begun);
@@ -256,6 +261,12 @@ export class View extends EventTarget {
     this.said.textContent = text;
   }
 
+  /** Say what is missing, until it is there (""). @param {string} text */
+  warn(text) {
+    if (text || this.said.textContent === this.warning) this.say(text);
+    this.warning = text;
+  }
+
   /** How many Gaussians are drawn; 0 where the server draws them. */
   get gaussians() {
     return this.surface?.gaussians ?? 0;
@@ -313,7 +324,10 @@ export class View extends EventTarget {
 
   /** Look from a camera's side: upright, towards the middle of the scene. It becomes the view of `goHome`. @param {Camera} camera */
   frame(camera) {
-    this.pose = lookingAt(poseOf(camera).position, this.focus, this.up);
+    const { position, down } = poseOf(camera);
+    this.pose = lookingAt(position, this.focus, this.up);
+    // Straight from above, no side is up: what is up in the photo is.
+    if (Math.abs(dot(this.pose.forward, this.up)) > STEEP) this.pose = lookingAt(position, this.focus, times(down, -1));
     this.distance = Math.max(length(sub(this.focus, this.pose.position)), 1e-3);
     this.tangents = tangentsOf(camera);
     this.settle();

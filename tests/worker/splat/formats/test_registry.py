@@ -20,6 +20,7 @@ def test_the_table_of_formats_says_what_can_be_read_and_written() -> None:
     for suffix, form in MODEL_FORMATS.items():
         codec = registry.CODECS[suffix]
         assert (codec.read is not None, codec.write is not None) == (form.readable, form.writable), suffix
+        assert (codec.files is not None) == form.folder, suffix
         assert form.suffix == suffix == suffix.lower()
         assert form.loses.endswith(".")
 

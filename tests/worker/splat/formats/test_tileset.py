@@ -129,15 +129,37 @@ def test_it_lies_where_the_frame_of_the_model_says(tmp_path: Path) -> None:
         np.testing.assert_allclose(found, geodesy.earth_centered(place[None])[0], atol=1e-6)
 
 
-def test_without_a_place_it_stands_upright_in_its_own_coordinates(tmp_path: Path) -> None:
-    scene = some_gaussians(50, 0)
+@pytest.mark.parametrize("degree", [0, 3])
+def test_without_a_place_it_stands_upright_in_its_own_coordinates(tmp_path: Path, degree: int) -> None:
+    scene = some_gaussians(50, degree)
     path = tmp_path / "tileset.json"
-    registry.write(path, scene, up=(0.0, 0.0, 1.0))
+    offset = (7.0, -2.0, 5.0)
+    registry.write(path, scene, offset=offset, up=(0.0, 0.0, 1.0))
     root = json.loads(path.read_text())["root"]
-    np.testing.assert_allclose(np.array(root["transform"]).reshape(4, 4), np.eye(4), atol=1e-12)
+    transform = np.array(root["transform"]).reshape(4, 4).T
+    # CesiumJS draws no Gaussians of a node that is rotated.
     document, found, _ = _contents(tmp_path, root, tmp_path / "tile.spz")
-    box = root["boundingVolume"]["box"]
-    assert _inside(box, scene.means.numpy())
-    np.testing.assert_allclose(box[:3], _middle(scene), atol=1e-5)
-    assert document["nodes"][0]["rotation"] == pytest.approx([np.sqrt(0.5), 0, 0, np.sqrt(0.5)])
+    assert document["nodes"] == [{"mesh": 0}]
+    assert len(document["meshes"][0]["primitives"][0]["attributes"]) == 4 + (degree + 1) ** 2 - 1
     assert found.count == 50
+    # The world of the model has z up, as tiles have.
+    for mean in scene.means[:5].double().numpy():
+        shown = (transform @ [*(UPRIGHT @ mean), 1])[:3]
+        np.testing.assert_allclose(shown, mean + offset, atol=1e-6)
+    assert _inside(root["boundingVolume"]["box"], scene.means.numpy() @ UPRIGHT.T)
+    np.testing.assert_allclose(root["boundingVolume"]["box"][:3], UPRIGHT @ _middle(scene), atol=1e-5)
+
+
+def test_a_place_is_that_of_a_model_with_y_down_whatever_its_photos_say(tmp_path: Path) -> None:
+    for name, up in (("a", (0.0, 0.0, 1.0)), ("b", None)):
+        registry.write(
+            tmp_path / name / "tileset.json", some_gaussians(5, 0), up=up, to_earth=np.diag([2.0, 2, 2, 1])
+        )
+    assert (tmp_path / "a/tileset.json").read_text() == (tmp_path / "b/tileset.json").read_text()
+
+
+def test_of_no_gaussians_nothing_is_shown(tmp_path: Path) -> None:
+    assert registry.write(tmp_path / "tileset.json", some_gaussians(0, 0)) == 0
+    root = json.loads((tmp_path / "tileset.json").read_text())["root"]
+    assert "content" not in root
+    assert np.linalg.det(np.array(root["boundingVolume"]["box"][3:]).reshape(3, 3)) != 0

@@ -274,7 +274,9 @@ def _train(
 
 def _pipeline(attempt: Attempt, load: LoadPipeline, row: JobRow, folder: JobFolder, room: Room) -> Pipeline:
     """What does the work of the job: of a scene in tiles, other workers do some."""
-    pipeline = load()
+    pipeline = (
+        load()
+    )  # for a scene in tiles too: a module that SPLATMILL_PIPELINE names may record what its units do
     if row.options.tiles is None:
         return pipeline
     from splatmill_worker.service.units.other_workers import OtherWorkers

@@ -41,10 +41,14 @@ class Writer(Protocol):
 
 @dataclass(frozen=True)
 class Codec:
-    """The functions of a format; None where it is not read, or not written."""
+    """The functions of a format; None where it is not read, or not written.
+
+    files: all files of a model that was written to a folder of files.
+    """
 
     read: Reader | None
     write: Writer | None
+    files: Callable[[Path], list[Path]] | None = None
 
 
 def _read_ply(path: Path) -> Contents:
@@ -65,19 +69,12 @@ CODECS: dict[str, Codec] = {
     ".ksplat": Codec(ksplat.read, None),
     ".sog": Codec(sog.read, sog.write),
     "meta.json": Codec(sog.read, None),
-    "lod-meta.json": Codec(streamed_sog.read, streamed_sog.write),
+    "lod-meta.json": Codec(streamed_sog.read, streamed_sog.write, streamed_sog.files),
     ".lod.zip": Codec(streamed_zip.read, streamed_zip.write),
     ".glb": Codec(glb.read, glb.write),
-    "tileset.json": Codec(None, tileset.write),
+    "tileset.json": Codec(None, tileset.write, tileset.files),
 }
 """One for each of `MODEL_FORMATS`; a test compares them."""
-
-
-FOLDERS: dict[str, Callable[[Path], list[Path]]] = {
-    "lod-meta.json": streamed_sog.files,
-    "tileset.json": tileset.files,
-}
-"""By the name of the index, the files of a model that was written to a folder."""
 
 
 def reader(path: Path) -> Reader:
@@ -114,8 +111,9 @@ def read(path: Path) -> Contents:
 
 def size(path: Path) -> int:
     """The bytes of a model that was written to `path`, those of the files beside it included."""
-    folder = FOLDERS.get(path.name.lower())
-    parts = [path] if folder is None else folder(path)
+    found = format_of(path.name)
+    files = None if found is None else CODECS[found.suffix].files
+    parts = [path] if files is None else files(path)
     return sum(part.stat().st_size for part in parts)
 
 

@@ -28,8 +28,11 @@ MOST = 32768
 """Gaussians of a tile at most, unless a leaf has more: about 0.7 MB."""
 
 PIXELS = 16.0
-"""The error on the screen, in pixels, up to which viewers show a tile by default. Errors are written as so many times
-what they are, so that the next level is loaded once the error of a tile reaches one pixel."""
+"""The error on the screen, in pixels, up to which viewers show a tile by default. All errors are multiplied by it, so
+that the next level is loaded once the error of a tile reaches one pixel."""
+
+THINNEST = 1e-3
+"""Sides of a box at least, as viewers divide by them."""
 
 FOLDER = "tiles"
 """Beside the index: the folder of the tiles."""
@@ -38,6 +41,12 @@ COMPRESSED = "KHR_gaussian_splatting_compression_spz_2"
 EXTENSIONS = [glb.EXTENSION, COMPRESSED]
 
 Float = npt.NDArray[np.float64]
+
+FROM_GLTF: Float = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+"""From the frame of glTF, y up, to that of tiles, z up: viewers turn the content of a tile by it."""
+
+TURN: Float = FROM_GLTF @ np.diag([1.0, -1.0, -1.0])
+"""From the frame of a `.ply`, y down, to that of tiles."""
 
 
 def write(
@@ -54,11 +63,14 @@ def write(
     The surroundings of the scene (`lod.levels.surroundings`) are left out: around a place on the earth is the earth. So
     are rows with a non-finite parameter and rows with an opacity under MIN_OPACITY.
 
-    offset: of `Contents`. antialiased: a flag of each `.spz`. up: as of `gltf.node`.
+    offset: of `Contents`. antialiased: a flag of each `.spz`.
     to_earth: matrix [4, 4] from metres to the east, to the north and upwards of the model's origin to metres from the
-    earth's centre; None where it is not known, and the tileset has the coordinates of the model, z up.
+    earth's centre, for a model with x to the east, y down and z to the north. None: the tileset has the coordinates of
+    the model, turned so that z is up.
+    up: of a model without `to_earth`, as of `gltf.node`.
 
-    An index that is there is removed first and the new one is written last. Raises OSError.
+    An index that is there is removed first and the new one is written last. Tiles of an earlier one that the new one
+    does not name stay. Raises OSError.
     """
     levels = make_levels(visible(gaussians))
     write_levels(path, levels, offset=offset, antialiased=antialiased, up=up, to_earth=to_earth)
@@ -76,14 +88,13 @@ def write_levels(
     most: int = MOST,
 ) -> None:
     """Write levels as `write` does. most: Gaussians of a tile at most, unless a leaf has more."""
-    tiles = _Tiles(levels, leaf_boxes(levels), path.parent, gltf.node(up), antialiased, most)
+    tiles = _Tiles(levels, leaf_boxes(levels), path.parent, antialiased, most)
     path.unlink(missing_ok=True)
     (path.parent / FOLDER).mkdir(parents=True, exist_ok=True)
     root = tiles.write(levels.tree, len(levels.levels) - 1)
     moved = np.eye(4)
-    moved[:3, 3] = tiles.turn @ offset
-    if to_earth is not None:
-        moved = to_earth @ moved
+    moved[:3, 3] = TURN @ offset
+    moved = (_upright(up) if to_earth is None else to_earth) @ moved
     document = {
         "asset": {"version": "1.1", "generator": "Splatmill"},
         "extensionsUsed": ["3DTILES_content_gltf"],
@@ -93,7 +104,7 @@ def write_levels(
         "geometricError": PIXELS * float(np.linalg.norm(root["boundingVolume"]["box"][3:])),
         "root": {"transform": moved.T.flatten().tolist(), "refine": "REPLACE", **root},
     }
-    atomic_write(path, json.dumps(document, separators=(",", ":")), sync=True)
+    atomic_write(path, json.dumps(document, separators=(",", ":"), allow_nan=False), sync=True)
 
 
 def files(path: Path) -> list[Path]:
@@ -111,23 +122,16 @@ def files(path: Path) -> list[Path]:
 class _Tiles:
     """Writes the tiles of a scene.
 
-    boxes: of its leaves (`leaf_boxes`). folder: of the index. node: of each `.glb`. most: Gaussians of a tile.
-    turn: matrix [3, 3] from the frame of a `.ply` to that of the tiles, whose z is up.
+    boxes: of its leaves (`leaf_boxes`). folder: of the index. most: Gaussians of a tile.
     written: how many tiles there are.
     """
 
     levels: Levels
     boxes: Tensor
     folder: Path
-    node: dict[str, Any]
     antialiased: bool
     most: int
     written: int = 0
-
-    def __post_init__(self) -> None:
-        # Viewers turn the content of a tile from glTF, whose y is up.
-        upright = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-        self.turn: Float = upright @ _matrix(self.node.get("rotation")) @ np.diag([1.0, -1.0, -1.0])
 
     def write(self, node: Node, level: int) -> dict[str, Any]:
         """Write the tile of a node in a level, and those of the finer levels below it; returns what the index says."""
@@ -143,7 +147,6 @@ class _Tiles:
             _write_tile(
                 self.folder / name,
                 self.levels.levels[level].gaussians.select(rows),
-                self.node,
                 antialiased=self.antialiased,
             )
             tile["content"] = {"uri": name}
@@ -167,21 +170,27 @@ class _Tiles:
         """The box of a node in the frame of the tiles: its centre, and half of each side as a vector."""
         low = self.boxes[0, node.first : node.last].amin(0).numpy()
         high = self.boxes[1, node.first : node.last].amax(0).numpy()
-        sides = self.turn @ np.diag((high - low) / 2)
-        return [*(self.turn @ ((low + high) / 2)).tolist(), *sides.T.flatten().tolist()]
+        sides = TURN @ np.diag(np.maximum(high - low, THINNEST) / 2)
+        return [*(TURN @ ((low + high) / 2)).tolist(), *sides.T.flatten().tolist()]
 
 
-def _matrix(quaternion: list[float] | None) -> Float:
-    """The matrix [3, 3] of a unit quaternion xyzw; None is no rotation."""
-    if quaternion is None:
-        return np.eye(3)
-    vector, w = np.array(quaternion[:3]), quaternion[3]
-    cross = np.cross(np.eye(3), vector)
-    return np.eye(3) + 2.0 * w * cross + 2.0 * cross @ cross
+def _upright(up: gltf.Up | None) -> Float:
+    """The matrix [4, 4] that turns tiles so that `up`, in the frame of a `.ply`, is their z axis."""
+    rotation = gltf.node(up).get("rotation")
+    matrix = np.eye(4)
+    if rotation is not None:
+        vector, w = np.array(rotation[:3]), rotation[3]
+        cross = np.cross(np.eye(3), vector)  # by rows; v x is the matrix itself, as it is antisymmetric
+        turn = np.eye(3) + 2.0 * w * cross + 2.0 * cross @ cross
+        matrix[:3, :3] = FROM_GLTF @ turn @ FROM_GLTF.T
+    return matrix
 
 
-def _write_tile(path: Path, gaussians: Gaussians, node: dict[str, Any], *, antialiased: bool) -> None:
-    """Write a `.glb` whose attributes are those of the `.spz` in it: none of them has an array of its own."""
+def _write_tile(path: Path, gaussians: Gaussians, *, antialiased: bool) -> None:
+    """Write a `.glb` whose attributes are those of the `.spz` in it: none of them has an array of its own.
+
+    Its node has no rotation, which CesiumJS 1.145 does not apply to Gaussians.
+    """
     parts = gltf.Parts()
     view = parts.add_file(spz.encoded(gaussians, antialiased=antialiased))
     means = gaussians.means * torch.tensor([1.0, -1.0, -1.0])  # the frame of glTF
@@ -210,7 +219,7 @@ def _write_tile(path: Path, gaussians: Gaussians, node: dict[str, Any], *, antia
         "extensionsRequired": EXTENSIONS,
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [node],
+        "nodes": [{"mesh": 0}],
         "meshes": [{"primitives": [primitive]}],
         **parts.document(),
     }

@@ -6,6 +6,9 @@ from splatmill.schema import Switch, TrainOptions
 from splatmill_worker.splat.plan.facts import Facts
 from splatmill_worker.splat.plan.reasons import Decision, switch
 
+MOST_FOR_LPIPS = 64
+"""Held-out photos up to which LPIPS is measured without being asked for, which takes a minute or two."""
+
 
 def decide_lpips(facts: Facts, options: TrainOptions) -> Decision[bool]:
     """Whether LPIPS of the held-out photos is measured at the end."""
@@ -16,6 +19,12 @@ def decide_lpips(facts: Facts, options: TrainOptions) -> Decision[bool]:
     if options.lpips is Switch.auto and options.timed:
         return Decision(
             False, "LPIPS takes a second and more of each photo; where time is limited, lpips has to be on."
+        )
+    if options.lpips is Switch.auto and facts.held_out > MOST_FOR_LPIPS:
+        return Decision(
+            False,
+            f"LPIPS takes a second and more of each photo, and {facts.held_out} are held out; on more than "
+            f"{MOST_FOR_LPIPS}, lpips has to be on.",
         )
     because = (
         f"The weights of LPIPS are installed; it is measured on {facts.held_out} held-out photos at the end."

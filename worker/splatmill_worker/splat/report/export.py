@@ -52,8 +52,11 @@ class ExportWorld:
 
     @property
     def up(self) -> tuple[float, float, float] | None:
-        """What points up; None where nothing but how the photos were held says so. In a chosen frame, y points down."""
-        return None if self.frame is None else (0.0, -1.0, 0.0)
+        """What points up in a frame that was chosen, in which y points down and the origin is what the cameras look at.
+
+        None for other worlds, of which neither is known.
+        """
+        return None if self.frame is None or self.offset.any() else (0.0, -1.0, 0.0)
 
     def camera(self, camera: Camera) -> Camera:
         """A camera of the training world in this world."""

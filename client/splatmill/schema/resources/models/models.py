@@ -81,8 +81,9 @@ class ModelCameras(Response):
     cameras: list[ModelCamera]
     up: tuple[float, float, float] | None = Field(
         default=None,
-        description="Unit vector that points up in the coordinates of the model, whose origin is what the cameras look "
-        "at; null where the coordinates came with the photos, which then say neither.",
+        description="Unit vector that points up in the coordinates of the model, if they were chosen when the cameras "
+        "were recovered: their origin then is what the cameras look at. null where they came with the photos, and for "
+        "models of versions that did not store it.",
     )
 
 

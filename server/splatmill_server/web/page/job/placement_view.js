@@ -100,7 +100,7 @@ export class PlacementView {
     };
     const positions = cameras.map((camera) => poseOf(camera).position);
     const common = level(mean(positions));
-    return unit(length(common) > 0.3 * this.spread ? common : level(positions[0]), times(poseOf(cameras[0]).forward, -1));
+    return unit(length(common) > 0.3 * this.spread ? common : level(positions[0]), poseOf(cameras[0]).down);
   }
 
   /** Look at all of it from behind the cameras and above. */

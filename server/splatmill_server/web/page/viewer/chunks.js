@@ -93,6 +93,7 @@ export class Chunks {
 
   destroy() {
     this.ended = true;
+    this.pieces.end();
     removeEventListener("online", this.again);
     this.begun();
     this.waiting.clear();
@@ -139,7 +140,7 @@ export class Chunks {
 
   /** Take back what was said of a chunk, which is there or not wanted any more. @param {string} url */
   arrived(url) {
-    if (this.reported.delete(url) && !this.reported.size) this.on.failed(null);
+    if (!this.ended && this.reported.delete(url) && !this.reported.size) this.on.failed(null);
   }
 
   /** Give up a chunk, and all where the server refuses them. @param {string} url @param {Error} error @param {boolean} coarse */

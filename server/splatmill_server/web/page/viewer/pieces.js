@@ -15,7 +15,8 @@ const TAIL = 1 << 16;
 
 /** Milliseconds after which a part that did not come is asked for again; after the last one it is given up. */
 const PAUSES = [1000, 4000, 16000];
-/** Milliseconds without a byte after which a part is taken for one that does not come. */
+/** Milliseconds without an answer, and then without a further byte, after which a part is taken for one that does not come. */
+const UNANSWERED = 60_000;
 const STALLED = 20_000;
 /** Milliseconds that a server may ask for before the next attempt; what asks for more is given up. */
 const LONGEST_PAUSE = 90_000;
@@ -62,6 +63,10 @@ export class Pieces {
     this.size = 0;
     /** Bytes that were read so far. */
     this.loaded = 0;
+    /** Ends all that is loaded. */
+    this.ending = new AbortController();
+    /** When the server may be asked again, in milliseconds of `performance.now()`. */
+    this.notBefore = 0;
     /** By folder, the files in it. @type {Map<string, Entry[]>} */
     this.folders = new Map();
     /** The folders of the coarsest level, which the first picture is drawn from. @type {Set<string>} */
@@ -153,16 +158,27 @@ export class Pieces {
         if (error instanceof ViewerError && error.reason === "refused") throw error;
         const asked = error instanceof Passing ? error.after : 0;
         if (asked > LONGEST_PAUSE) throw error;
-        await new Promise((resolve) => setTimeout(resolve, Math.max(pause, asked)));
+        this.notBefore = Math.max(this.notBefore, performance.now() + asked);
+        await this.wait(pause);
       }
     }
     return this.fetchedOnce(range);
   }
 
+  /** @param {number} pause  milliseconds */
+  async wait(pause) {
+    await new Promise((resolve) => setTimeout(resolve, pause));
+  }
+
   /** @param {string} range @returns {Promise<Uint8Array>} */
   async fetchedOnce(range) {
     const failed = (/** @type {string} */ why) => new ViewerError("refused", sentence(why));
-    const patience = new Patience();
+    for (let left = 1; left > 0; ) {
+      left = this.notBefore - performance.now();
+      if (left > 0) await this.wait(left);
+    }
+    if (this.ending.signal.aborted) throw failed("the view was closed");
+    const patience = new Patience(this.ending.signal);
     try {
       // Without If-Range, with which browsers keep nothing of what they load.
       const answer = await fetch(/** @type {string} */ (this.file), { headers: { Range: range }, signal: patience.signal });
@@ -176,11 +192,17 @@ export class Pieces {
       this.loaded += bytes.length;
       return bytes;
     } catch (error) {
+      if (this.ending.signal.aborted) throw failed("the view was closed");
       if (error instanceof ViewerError) throw error;
-      throw new Passing(patience.signal.aborted ? `nothing came for ${STALLED / 1000} s` : "the server could not be reached", 0, error);
+      throw new Passing(patience.over ? "the server sent nothing more" : "the server could not be reached", 0, error);
     } finally {
       patience.end();
     }
+  }
+
+  /** Load nothing any more. */
+  end() {
+    this.ending.abort();
   }
 }
 
@@ -193,30 +215,44 @@ class Passing extends ViewerError {
   }
 }
 
-/** Ends a request of which nothing came for STALLED. */
+/** Ends a request that nothing comes of. */
 class Patience {
-  constructor() {
-    this.ending = new AbortController();
-    this.signal = this.ending.signal;
+  /** @param {AbortSignal} ending  ends it as well */
+  constructor(ending) {
+    this.request = new AbortController();
+    this.signal = this.request.signal;
+    this.ending = ending;
+    this.stop = () => this.request.abort();
+    ending.addEventListener("abort", this.stop);
+    /** Whether nothing came for too long. */
+    this.over = false;
     this.timer = 0;
-    this.begin();
+    this.expect(UNANSWERED);
   }
 
-  begin() {
-    this.end();
-    this.timer = setTimeout(() => this.ending.abort(), STALLED);
+  /** @param {number} within  milliseconds */
+  expect(within) {
+    clearTimeout(this.timer);
+    this.timer = setTimeout(() => {
+      this.over = true;
+      this.request.abort();
+    }, within);
   }
 
+  /** End the request, if its bytes were not read to their end. */
   end() {
     clearTimeout(this.timer);
+    this.ending.removeEventListener("abort", this.stop);
+    this.request.abort();
   }
 
   /** @param {Response} answer */
   async bytesOf(answer) {
     const reader = /** @type {ReadableStream<Uint8Array>} */ (answer.body).getReader();
     const parts = [];
+    this.expect(STALLED);
     for (let part = await reader.read(); !part.done; part = await reader.read()) {
-      this.begin();
+      this.expect(STALLED);
       parts.push(part.value);
     }
     return joined(parts);

@@ -141,8 +141,9 @@ export function projected(pose, point, focal, width, height) {
  * What the cameras of the photos tell about a scene.
  *
  * up: what is known to be up, or the mean of the directions that are up in the photos.
- * focus: the origin where up is known, which it then is; else the point nearest to all optical axes (least squares), or
- *   where these are almost parallel, or meet behind the cameras, a point in front of the cameras' mean position.
+ * focus: the origin where up is known and most cameras have the origin ahead; else the point nearest to all optical
+ *   axes (least squares), or where these are almost parallel, or meet behind the cameras, a point in front of the
+ *   cameras' mean position.
  * middle: the mean position.
  * spread: the distance of the farthest camera from it.
  *
@@ -156,7 +157,8 @@ export function surroundings(cameras, known) {
   const distances = poses.map((pose) => length(sub(pose.position, middle)));
   const spread = Math.max(...distances);
   /** @type {Vec} */
-  const focus = known ? [0, 0, 0] : nearestToAxes(poses) ?? add(middle, times(ahead, 3 * (spread || 1)));
+  const origin = [0, 0, 0];
+  const focus = known && inFront(poses, origin) ? origin : nearestToAxes(poses) ?? add(middle, times(ahead, 3 * (spread || 1)));
   const up = known ?? unit(times(mean(poses.map((pose) => pose.down)), -1), [0, -1, 0]);
   return { up, focus, middle, spread };
 }
@@ -217,6 +219,10 @@ function nearestToAxes(poses) {
     add(add(times(cross(r1, r2), b0), times(cross(r2, r0), b1)), times(cross(r0, r1), b2)),
     1 / det,
   );
-  const inFront = poses.filter((pose) => dot(sub(point, pose.position), pose.forward) > 0).length;
-  return 2 * inFront > poses.length ? point : null;
+  return inFront(poses, point) ? point : null;
+}
+
+/** Whether most cameras have a point ahead of them. @param {Pose[]} poses @param {Vec} point */
+function inFront(poses, point) {
+  return 2 * poses.filter((pose) => dot(sub(point, pose.position), pose.forward) > 0).length > poses.length;
 }
