@@ -109,6 +109,7 @@ NO_DECISION = {
     "schedule.densify_every": "often in all runs",
     "schedule.densify_until": "late in all runs",
     "schedule.expected_steps": "follows from the end",
+    "schedule.in_view": "of which the other fields of the schedule are made",
     "seed": "changes no path",
     "reasons": "words",
     "left_out": "words",

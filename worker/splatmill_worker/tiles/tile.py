@@ -155,7 +155,9 @@ def tile_plan(coarse: Coarse, free: int, photos: int) -> Plan:
         target_psnr=plan.target_psnr if aside is not None else None,
         lpips=False,
         schedule=replace(
-            schedule, resolution=((0, 1),), earlier_visits=coarse.steps / max(1, len(coarse.viewmats))
+            schedule.seen_by(photos / len(coarse.viewmats)),
+            resolution=((0, 1),),
+            earlier_visits=coarse.steps / max(1, len(coarse.viewmats)),
         ),
     )
 

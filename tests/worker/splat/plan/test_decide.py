@@ -170,6 +170,28 @@ def test_small_photos_are_not_reduced() -> None:
     assert "80 pixels" in small.left_out["coarse_to_fine"]
 
 
+def test_the_course_is_counted_in_steps_that_have_a_part_of_the_scene_in_view() -> None:
+    """Many captures side by side, trained together for as many times the steps, have the course of one."""
+    alone = planned(changed(in_view=0.5), steps=1000).schedule
+    assert planned(changed(in_view=0.9), steps=1000).schedule == alone
+    assert (alone.resolution, alone.densify_from, alone.densify_every) == (
+        ((0, 4), (125, 2), (333, 1)),
+        125,
+        50,
+    )
+    together = planned(changed(in_view=0.025, views=800), steps=20_000)
+    course = together.schedule
+    assert (course.resolution, course.densify_from) == (((0, 4), (2500, 2), (6660, 1)), 2500)
+    assert course.densify_every == 1000
+    assert "2.5 % of the points in view" in together.reasons["densify"]
+    whole = course.seen_by(0.05)
+    assert (whole.densify_from, whole.densify_every, whole.in_view) == (125, 50, 1.0)
+    half = course.seen_by(0.1)
+    assert (half.densify_from, half.densify_every, half.in_view) == (250, 100, 0.5)
+    # However little of it photos have in view, the first Gaussians are added at some time.
+    assert planned(changed(in_view=0.0), steps=1000).schedule.densify_from == 500
+
+
 def test_the_far_shell_keeps_its_opacities() -> None:
     backed = changed(sky_share=0.2, shell_points=700, shell_distance=20.0)
     assert planned(backed).schedule.decay_within == 10.0

@@ -19,6 +19,7 @@ from splatmill_worker.kernels.gpu.device import largest_budget
 from splatmill_worker.splat.plan.budget import Budget
 from splatmill_worker.splat.plan.deadline import training_seconds
 from splatmill_worker.splat.plan.facts import Facts, Speed
+from splatmill_worker.splat.plan.in_view import share_in_view
 from splatmill_worker.splat.plan.needs import HALF_TURN
 from splatmill_worker.splat.plan.photos import least_gain
 from splatmill_worker.splat.plan.plan import Kernels, Plan
@@ -93,12 +94,17 @@ def _ended(capacity: Capacity, facts: Facts, most: int | None) -> Capacity:
     )
 
 
-def decide_densification(options: TrainOptions, most: int, *, initial: int) -> Decision[bool]:
+def decide_densification(facts: Facts, options: TrainOptions, most: int, *, initial: int) -> Decision[bool]:
     """Whether Gaussians are added in training, of which there may be `most`."""
     if initial >= most:
         because = f"Training starts with {initial} Gaussians, as many as are allowed."
     else:
         because = f"Training starts with {initial} Gaussians, and {most} are allowed."
+        if facts.coverage is not None and share_in_view(facts) < 1.0:
+            because += (
+                f" A photo has {100 * facts.coverage.in_view:.2g} % of the points in view (median), so they are added "
+                f"{1 / share_in_view(facts):.2g} times as seldom as where it has half."
+            )
     return switch(options.densify, Decision(initial < most, because))
 
 

@@ -7,8 +7,8 @@ from typing import Any, Literal
 from splatmill.schema import PHOTOS_PER_VALIDATION, Background, TrainOptions
 from splatmill_worker.kernels.records import BETA2
 from splatmill_worker.splat.plan.capacity import decide_capacity, decide_densification
-from splatmill_worker.splat.plan.culling import decide_culling
 from splatmill_worker.splat.plan.facts import Facts
+from splatmill_worker.splat.plan.in_view import decide_culling, share_in_view
 from splatmill_worker.splat.plan.needs import FEW_VIEWS, needs_of
 from splatmill_worker.splat.plan.photos import (
     decide_antialias,
@@ -63,7 +63,7 @@ def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
         "cluster_culling": (culling := decide_culling(facts, options, kernels, most)),
         "budget": capacity.budget,
         "schedule": capacity.steps,
-        "densify": (densify := decide_densification(options, most, initial=initial)),
+        "densify": (densify := decide_densification(facts, options, most, initial=initial)),
         "coarse_to_fine": (coarse := _coarse_to_fine(facts, image_size.value)),
         "sh_degree": (degree := _degree(facts, options)),
         "rates": (annealing := _annealing(facts, options, steps)),
@@ -78,15 +78,16 @@ def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
         "antialias": (antialias := decide_antialias(facts, options)),
     }
     explanation, gain = Explanation.of(decisions), least_gain(facts, options)
+    share = share_in_view(facts)
     shell = None if facts.coverage is None else facts.coverage.shell_distance
     return Plan(
         schedule=Schedule(
             budget=capacity.budget.value,
             longest=capacity.longest,
-            resolution=_resolution(steps, image_size.value) if coarse.value else ((0, 1),),
+            resolution=_resolution(steps, share, image_size.value) if coarse.value else ((0, 1),),
             degree=degree.value,
-            densify_from=max(50, min(300, steps // 8)),
-            densify_every=max(40, min(100, steps // 20)),
+            densify_from=min(steps // 2, round(max(50, min(300, steps * share // 8)) / share)),
+            densify_every=round(max(40, min(100, steps * share // 20)) / share),
             densify_until=0.7,
             opacity_decay=OPACITY_DECAY if densify.value else 1.0,
             # Half way to the shell, so that all of the shell is spared and most of the scene is not.
@@ -95,6 +96,7 @@ def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
             dropout=dropout.value,
             ends_at=capacity.ends_at,
             expected_steps=steps,
+            in_view=share,
         ),
         image_size=image_size.value,
         max_gaussians=most,
@@ -172,9 +174,10 @@ def _coarse_to_fine(facts: Facts, image_size: int) -> Decision[bool]:
     return Decision(True, "")
 
 
-def _resolution(steps: int, image_size: int) -> tuple[tuple[int, int], ...]:
+def _resolution(steps: int, share: float, image_size: int) -> tuple[tuple[int, int], ...]:
     """Coarse to fine: a quarter of the photos' size first, then half, then all of it (decisions: coarse-to-fine)."""
-    first, second = max(20, min(200, steps // 8)), max(50, min(500, steps // 3))
+    first = round(max(20, min(200, steps * share // 8)) / share)
+    second = round(max(50, min(500, steps * share // 3)) / share)
     if image_size < 240:
         return ((0, 2), (second, 1))
     return ((0, 4), (first, 2), (second, 1))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from splatmill_worker.splat.plan.budget import Budget
 from splatmill_worker.splat.plan.rates import Annealing
@@ -38,6 +38,7 @@ class Schedule:
         of the far shell is hidden from the photos, and decay would remove it. None: no such distance.
     annealing: how the learning rates fall.
     dropout: largest share of the Gaussians that a step leaves out at random; see `left_out`.
+    in_view: share of the steps that have a part of the scene in view, over that of small captures (`share_in_view`).
     earlier_visits: steps on each photo before the first of this run, for `dropout`: a tile starts from a model that has
         been trained on them.
     ends_at: steps after which few photos from one side end the run, whatever its budget; None where they do not.
@@ -56,7 +57,18 @@ class Schedule:
     dropout: float = 0.0
     longest: int | None = None
     ends_at: int | None = None
+    in_view: float = 1.0
     earlier_visits: float = 0.0
+
+    def seen_by(self, photos: float) -> Schedule:
+        """The schedule for a part of the scene that this share of the photos shows, 0 to 1, trained on these alone."""
+        share = min(1.0, self.in_view / photos)
+        return replace(
+            self,
+            in_view=share,
+            densify_from=round(self.densify_from * self.in_view / share),
+            densify_every=round(self.densify_every * self.in_view / share),
+        )
 
     @property
     def reduced_until(self) -> int:

@@ -1,4 +1,4 @@
-"""The decision whether steps leave out clusters of Gaussians that the photo does not show."""
+"""What follows from how much of the scene a photo has in view: what steps leave out, and the length of a course."""
 
 from __future__ import annotations
 
@@ -13,6 +13,19 @@ the sorting of the Gaussians at each densification by far (decisions: cluster-cu
 
 MANY_GAUSSIANS = 100_000
 """Number of Gaussians that a scene may have from which steps leave some out (decisions: cluster-culling)."""
+
+
+LEAST_IN_VIEW = 1e-3
+"""Share of the scene that photos have in view at least: of a larger scene, half of the photos show next to nothing."""
+
+
+def share_in_view(facts: Facts) -> float:
+    """Share of the steps that have a part of the scene in view, over that of captures whose photos have half of it in
+    view or more: at most 1. The course of a run is counted in such steps (decisions: steps-in-view).
+    """
+    if facts.coverage is None:
+        return 1.0
+    return min(1.0, max(facts.coverage.in_view, LEAST_IN_VIEW) / MOST_IN_VIEW)
 
 
 def decide_culling(facts: Facts, options: TrainOptions, kernels: Kernels, most: int) -> Decision[bool]:
