@@ -35,10 +35,15 @@ def attempt_limit() -> int | None:
 def available() -> int:
     """Return how many more bytes this process can use: free on the machine, in its control groups, and of its limit."""
     found = [int(psutil.virtual_memory().available)]
-    found += [max(0, limit - used) for limit, used in _groups()]
+    found += [max(0, limit - taken) for limit, taken in _groups()]
     if (limit := attempt_limit()) is not None:
-        found.append(max(0, limit - sum(_memory_of(os.getpid()))))
+        found.append(max(0, limit - used()))
     return min(found)
+
+
+def used() -> int:
+    """Return the bytes that only this process can free, those in swap included, and its shared memory."""
+    return sum(_memory_of(os.getpid()))
 
 
 def return_freed() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from splatmill_worker.splat.plan.budget import Budget
 from splatmill_worker.splat.plan.facts import Speed
-from splatmill_worker.splat.plan.plan import Plan
+from splatmill_worker.splat.plan.plan import BYTES_PER_GAUSSIAN, Plan
 from tests.support.plans.facts import changed, planned
 
 
@@ -122,6 +122,9 @@ def test_memory_bounds_the_gaussians() -> None:
     assert plan.max_gaussians == Plan.gaussians_within(400_000_000) < planned(steps=30_000).max_gaussians
     assert "Memory" in plan.reasons["max_gaussians"]
     assert Plan.gaussians_within(0) == 1000
+    # What recovering the cameras of many photos leaves behind is no room for Gaussians.
+    after = planned(changed(memory_used=1_400_000_000), max_memory=1_600_000_000, steps=30_000)
+    assert after.max_gaussians == 200_000_000 // BYTES_PER_GAUSSIAN
 
 
 def test_more_gaussians_asked_for_never_cut_those_at_the_start() -> None:

@@ -124,7 +124,11 @@ def _max_gaussians(
         photo_bytes = round(3 * pixels * (facts.views + facts.held_out))
         by_memory = largest_budget(options.max_memory or facts.memory_available, round(pixels), photo_bytes)
     else:
-        by_memory = Plan.gaussians_within(options.max_memory or facts.memory_available // 2)
+        by_memory = (
+            Plan.gaussians_within(facts.memory_available // 2)
+            if options.max_memory is None
+            else Plan.gaussians_within(options.max_memory, facts.memory_used)
+        )
     most = min(max(by_photos, initial), by_memory)
     if options.max_gaussians is not None and options.max_gaussians <= most:
         return by_option(options.max_gaussians)

@@ -101,6 +101,8 @@ class Facts:
     halving_loss: median RMS difference between a photo and its half-size copy enlarged again, grey levels of 255.
     reprojection: median reprojection error, pixels; without stereo points.
     memory_available: memory that this process can still use, or free memory of the GPU for the gpu kernels, bytes.
+    memory_used: resident memory of this process when the plan is made, bytes: what recovering the cameras leaves behind
+        stays, and so do photos that are not in files.
     light: exposure and white balance of the photos; None where too few show the same points.
     geometry: None where it is not known which photos show which points.
     coverage: None without enough points, or where photos are transparent.
@@ -132,6 +134,7 @@ class Facts:
     halving_loss: float
     reprojection: float | None
     memory_available: int
+    memory_used: int = 0
     light: Light | None = None
     geometry: Geometry | None = None
     coverage: Coverage | None = None
@@ -202,6 +205,7 @@ def measure(scene: Scene, views: Sequence[TrainingView], held_out: int, speed: S
         reprojection=_reprojection(scene, max(width, height)),
         lens_residual=_lens_residual(scene, max(width, height)),
         memory_available=memory.available(),
+        memory_used=memory.used(),
         speed=speed,
         no_points=scene.facts.get("no_points"),
     )

@@ -91,6 +91,9 @@ class Plan:
         return Plan(**fields)
 
     @staticmethod
-    def gaussians_within(memory: int) -> int:
-        """Number of Gaussians that `memory` bytes hold beside the photos and the program itself; at least 1000."""
-        return max(1000, (memory - BYTES_OF_PROGRAM) // BYTES_PER_GAUSSIAN)
+    def gaussians_within(memory: int, used: int = 0) -> int:
+        """Number of Gaussians that `memory` bytes hold beside the photos and the program itself; at least 1000.
+
+        used: bytes that these are known to have, where that is more than BYTES_OF_PROGRAM.
+        """
+        return max(1000, (memory - max(used, BYTES_OF_PROGRAM)) // BYTES_PER_GAUSSIAN)
