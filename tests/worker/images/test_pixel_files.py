@@ -56,7 +56,9 @@ def test_the_pixels_are_those_in_memory(block: int, tmp_path: Path, monkeypatch:
     frame = Normalization(1.0, np.zeros(3))
     files = PixelFiles(tmp_path)
     for size in (WIDTH, 20):
-        inside, filed = load_views(photos, size), load_views(photos, size, files=files)
+        counted: list[int] = []
+        inside, filed = load_views(photos, size, told=counted.append), load_views(photos, size, files=files)
+        assert counted == list(range(1, 13))
         for one, other in zip(inside, filed, strict=True):
             first, second = TrainingView.of(one, frame), TrainingView.of(other, frame, files)
             exposure = np.array([0.2, -0.3, 0.1])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -64,6 +64,7 @@ def load_views(
     background: tuple[float, float, float] | None = None,
     threads: int | None = None,
     files: PixelFiles | None = None,
+    told: Callable[[int], None] = lambda loaded: None,
 ) -> list[Photo]:
     """Load the photos of `views`, several at a time.
 
@@ -71,6 +72,7 @@ def load_views(
     background: RGB, 0 to 1, behind transparent pixels; None keeps their stored colours.
     threads: photos loaded at a time; None: one per core.
     files: where pixels are kept; None: in memory.
+    told: called after each photo with how many are loaded.
 
     Raises UnusablePicture for a file that does not decode, OSError for one that is missing, or for a full disk, and
     ValueError for one whose shape differs from its camera's.
@@ -86,7 +88,11 @@ def load_views(
                 ),
                 order,
             )
-            return [photo for _, photo in sorted(zip(order, loaded, strict=True), key=lambda each: each[0])]
+            photos: dict[int, Photo] = {}
+            for index, photo in zip(order, loaded, strict=True):
+                photos[index] = photo
+                told(len(photos))
+            return [photos[index] for index in range(len(views))]
     finally:
         look_ups.forget()
         divided_photos.forget()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,7 +11,9 @@ from splatmill_worker import memory
 from splatmill_worker.images.load import load_views, training_size
 from splatmill_worker.images.pixel_files import PixelFiles
 from splatmill_worker.pipeline.cameras import Cameras
+from splatmill_worker.pipeline.events import Emit, progress_events
 from splatmill_worker.pipeline.job import Job
+from splatmill_worker.scene import View
 from splatmill_worker.splat.plan.light import Light
 from splatmill_worker.splat.plan.photos import BYTES_PER_PIXEL, fit_in_memory
 from splatmill_worker.splat.views import TrainingView
@@ -69,8 +72,10 @@ class Room:
         return Room(free if limit is None else min(free, limit), job.workdir)
 
 
-def load_photos(cameras: Cameras, size: int, room: Room) -> Photos:
+def load_photos(cameras: Cameras, size: int, room: Room, emit: Emit = lambda event: None) -> Photos:
     """All photos, undistorted, with `size` pixels at most on the longer side; in files where `room` is too small.
+
+    emit: is told how many are loaded.
 
     What this and earlier stages have freed is returned to the system: decoded photos leave pieces in the heap that
     can take as much memory as the photos that are kept.
@@ -81,12 +86,16 @@ def load_photos(cameras: Cameras, size: int, room: Room) -> Photos:
     )
     taken = BYTES_PER_PIXEL * pixels
     files = None if fit_in_memory(taken, room.memory) else PixelFiles(room.folder)
-    training, held_out = (
-        tuple(
-            TrainingView.of(photo, cameras.normalization, files)
-            for photo in load_views(views, size, files=files)
-        )
-        for views in (cameras.training, cameras.held_out)
-    )
+    report, total = progress_events(emit), len(cameras.training) + len(cameras.held_out)
+
+    def loaded(views: Sequence[View], before: int) -> tuple[TrainingView, ...]:
+        def told(count: int) -> None:
+            report("loading", before + count, total, "photos loaded")
+
+        photos = load_views(views, size, files=files, told=told)
+        return tuple(TrainingView.of(photo, cameras.normalization, files) for photo in photos)
+
+    training = loaded(cameras.training, 0)
+    held_out = loaded(cameras.held_out, len(training))
     memory.return_freed()
     return Photos(training, held_out, taken)

@@ -53,7 +53,7 @@ def plan_training(job: Job, cameras: Cameras, revise: Revise, stages: Stages) ->
     """
     room = Room.of(job)
     with stages.measured("load"):
-        photos = load_photos(cameras, loading_size(job.options, job.kernels), room)
+        photos = load_photos(cameras, loading_size(job.options, job.kernels), room, job.emit)
     with stages.measured("plan"):
         first = first_gaussians(job, cameras, photos)
         facts = _measure_facts(job, cameras, photos, first)
@@ -78,13 +78,15 @@ def overrun(facts: Facts, plan: Plan) -> str | None:
     )
 
 
-def planned_photos(cameras: Cameras, planned: Planned, stages: Stages) -> Photos:
+def planned_photos(job: Job, cameras: Cameras, planned: Planned, stages: Stages) -> Photos:
     """The photos as the plan wants them, loaded anew where it decides on a smaller size."""
     if planned.photos is not None:
         return planned.photos
     with stages.measured("load"):
         return _in_light(
-            load_photos(cameras, planned.plan.image_size, planned.room), planned.facts, planned.plan
+            load_photos(cameras, planned.plan.image_size, planned.room, job.emit),
+            planned.facts,
+            planned.plan,
         )
 
 

@@ -75,7 +75,7 @@ def run(
         emit(StateEvent(state=JobState.training))
         planned = plan_training(job, cameras, revise, stages)
         emit(PlanEvent(plan=planned.plan.as_dict()))
-        photos = planned_photos(cameras, planned, stages)
+        photos = planned_photos(job, cameras, planned, stages)
         plan = planned.plan
         first = seeded(planned.first, cameras, photos, plan)
         engine = open_engine(first, plan.kernels, clustered=plan.cluster_culling)

@@ -107,7 +107,7 @@ def write_scene(joining: Joining) -> dict[str, Any]:
     cameras = known_cameras(job, stages)
     write_plan(job.workdir / "plan.json", job.options, coarse.plan)
     planned = plan_training(job, cameras, lambda plan: plan, stages)
-    photos = _corrected(planned_photos(cameras, planned, stages), coarse)
+    photos = _corrected(planned_photos(job, cameras, planned, stages), coarse)
     planned = replace(planned, plan=_stated(joining))
     gaussians = joining.gaussians()
     engine = open_engine(gaussians, job.kernels)

@@ -140,7 +140,7 @@ def _coarse(context: Context, stages: Stages) -> dict[str, Any]:
             shutil.copyfile(job.workdir / PLAN_FILE, part)
     decided = planned.plan
     context.emit(PlanEvent(plan=decided.as_dict()))
-    photos = planned_photos(cameras, planned, stages)
+    photos = planned_photos(job, cameras, planned, stages)
     engine = open_engine(
         seeded(planned.first, cameras, photos, decided), decided.kernels, clustered=decided.cluster_culling
     )

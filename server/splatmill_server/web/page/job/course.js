@@ -13,6 +13,7 @@ const STAGES = new Map(Object.entries({
   stereo: "Adding points by stereo",
   alignment: "Placing the scan",
   depth: "Reading the depth maps",
+  loading: "Loading the photos",
   training: "Training",
   evaluation: "Comparing photos with the scene",
 }));
