@@ -110,6 +110,7 @@ NO_DECISION = {
     "schedule.densify_until": "late in all runs",
     "schedule.expected_steps": "follows from the end",
     "schedule.in_view": "of which the other fields of the schedule are made",
+    "schedule.position_scale": "a factor on a rate in all runs",
     "seed": "changes no path",
     "reasons": "words",
     "left_out": "words",

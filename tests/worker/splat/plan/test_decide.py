@@ -183,11 +183,15 @@ def test_the_course_is_counted_in_steps_that_have_a_part_of_the_scene_in_view() 
     course = together.schedule
     assert (course.resolution, course.densify_from) == (((0, 4), (2500, 2), (6660, 1)), 2500)
     assert course.densify_every == 1000
+    # Positions move by a part of what a photo has in view, not of the whole scene: of a surface 20 times as large, the
+    # extent is the root of that.
+    assert (alone.position_scale, course.position_scale) == (1.0, pytest.approx(0.05**0.5))
     assert "2.5 % of the points in view" in together.reasons["densify"]
     whole = course.seen_by(0.05)
     assert (whole.densify_from, whole.densify_every, whole.in_view) == (125, 50, 1.0)
     half = course.seen_by(0.1)
     assert (half.densify_from, half.densify_every, half.in_view) == (250, 100, 0.5)
+    assert half.position_scale == course.position_scale, "of the same extent"
     # However little of it photos have in view, the first Gaussians are added at some time.
     assert planned(changed(in_view=0.0), steps=1000).schedule.densify_from == 500
 

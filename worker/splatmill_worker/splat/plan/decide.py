@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, Literal
 
 from splatmill.schema import PHOTOS_PER_VALIDATION, Background, TrainOptions
@@ -97,6 +98,9 @@ def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
             ends_at=capacity.ends_at,
             expected_steps=steps,
             in_view=share,
+            position_scale=math.sqrt(
+                share
+            ),  # what is in view is a part of a surface (decisions: steps-in-view)
         ),
         image_size=image_size.value,
         max_gaussians=most,

@@ -39,6 +39,8 @@ class Schedule:
     annealing: how the learning rates fall.
     dropout: largest share of the Gaussians that a step leaves out at random; see `left_out`.
     in_view: share of the steps that have a part of the scene in view, over that of small captures (`share_in_view`).
+    position_scale: factor on the learning rate of the positions, which is proportional to the extent of the scene: over
+        that, the extent of what a photo has in view.
     earlier_visits: steps on each photo before the first of this run, for `dropout`: a tile starts from a model that has
         been trained on them.
     ends_at: steps after which few photos from one side end the run, whatever its budget; None where they do not.
@@ -58,6 +60,7 @@ class Schedule:
     longest: int | None = None
     ends_at: int | None = None
     in_view: float = 1.0
+    position_scale: float = 1.0
     earlier_visits: float = 0.0
 
     def seen_by(self, photos: float) -> Schedule:

@@ -144,7 +144,8 @@ class TrainingRun:
             annealing = replace(annealing, boost=boost_of(steps))
         elif budget.steps is not None:
             annealing = replace(annealing, boost=min(annealing.boost, boost_of(budget.steps)))
-        return RateSchedule(self.extent, annealing, self.state.rate_scale).at(progress)
+        extent = self.extent * self.plan.schedule.position_scale
+        return RateSchedule(extent, annealing, self.state.rate_scale).at(progress)
 
     @property
     def validated(self) -> list[tuple[int, float]]:
