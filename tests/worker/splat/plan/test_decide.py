@@ -185,7 +185,8 @@ def test_the_course_is_counted_in_steps_that_have_a_part_of_the_scene_in_view() 
     assert course.densify_every == 1000
     # Positions move by a part of what a photo has in view, not of the whole scene: of a surface 20 times as large, the
     # extent is the root of that.
-    assert (alone.position_scale, course.position_scale) == (1.0, pytest.approx(0.05**0.5))
+    assert alone.position_scale == 1.0
+    assert course.position_scale == pytest.approx(0.05**0.5)
     assert "2.5 % of the points in view" in together.reasons["densify"]
     whole = course.seen_by(0.05)
     assert (whole.densify_from, whole.densify_every, whole.in_view) == (125, 50, 1.0)
