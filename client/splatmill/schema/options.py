@@ -177,7 +177,8 @@ class TrainOptions(Request):
         le=4 * 10**12,
         description=(
             "Memory for training: 1.5GB, 2GiB, or a number of bytes. It limits the number of Gaussians, and photos "
-            "that need more than an eighth of it are kept on the disk. Left out, half of the machine's free memory, or "
+            "that need more than an eighth of it are kept on the disk. What recovering the cameras has left in memory "
+            "counts, but half of it at least is for Gaussians. Left out, half of the machine's free memory, or "
             "the free memory of the GPU."
         ),
         json_schema_extra=_BUDGET | {"kind": "bytes"},
@@ -379,7 +380,7 @@ class TrainOptions(Request):
         description=(
             "Measure LPIPS, a distance of pictures by image networks, on the held-out photos at the end. With auto, "
             "this is done where the weights of these networks are installed on the machine that trains, unless a "
-            "time budget is set; with on, a machine without them refuses the job."
+            "time budget is set or more than 64 photos are held out; with on, a machine without them refuses the job."
         ),
         json_schema_extra=_ENGINE,
     )

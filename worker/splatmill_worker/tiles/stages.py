@@ -224,7 +224,7 @@ def _shorter(plan: Plan) -> Plan:
     return replace(
         plan,
         schedule=replace(
-            schedule,
+            schedule.course(share(schedule.expected_steps), schedule.in_view),
             budget=replace(budget, steps=share(budget.steps)),
             longest=None if schedule.longest is None else share(schedule.longest),
             expected_steps=share(schedule.expected_steps),

@@ -137,8 +137,9 @@ export class View extends EventTarget {
     this.poster = document.createElement("img");
     this.poster.alt = "";
     this.poster.addEventListener("error", () => this.poster.remove());
-    /** What is being loaded, or why nothing is shown, in words. */
+    /** What of the model is missing, in words. */
     this.warning = "";
+    /** What is being loaded, or why nothing is shown, in words. */
     this.said = document.createElement("p");
     this.said.className = "said";
     this.said.setAttribute("role", "status");
@@ -258,13 +259,14 @@ export class View extends EventTarget {
 
   /** Say in the view what is being done; "" ends it. @param {string} text */
   say(text) {
-    this.said.textContent = text;
+    this.said.textContent = text || this.warning;
   }
 
   /** Say what is missing, until it is there (""). @param {string} text */
   warn(text) {
-    if (text || this.said.textContent === this.warning) this.say(text);
+    const shown = [this.warning, ""].includes(this.said.textContent ?? "");
     this.warning = text;
+    if (text || shown) this.say(text);
   }
 
   /** How many Gaussians are drawn; 0 where the server draws them. */

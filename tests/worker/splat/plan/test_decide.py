@@ -189,12 +189,21 @@ def test_the_course_is_counted_in_steps_that_have_a_part_of_the_scene_in_view() 
     assert course.position_scale == pytest.approx(0.05**0.5)
     assert "2.5 % of the points in view" in together.reasons["densify"]
     whole = course.seen_by(0.05)
-    assert (whole.densify_from, whole.densify_every, whole.in_view) == (125, 50, 1.0)
+    assert (whole.densify_from, whole.densify_every, whole.in_view) == (300, 100, 1.0)
     half = course.seen_by(0.1)
-    assert (half.densify_from, half.densify_every, half.in_view) == (250, 100, 0.5)
+    assert (half.densify_from, half.densify_every, half.in_view) == (600, 200, 0.5)
     assert half.position_scale == course.position_scale, "of the same extent"
-    # However little of it photos have in view, the first Gaussians are added at some time.
-    assert planned(changed(in_view=0.0), steps=1000).schedule.densify_from == 500
+    assert alone.seen_by(0.3) == alone
+
+
+@pytest.mark.parametrize("share", [1e-3, 0.01, 0.05, 0.2, 0.49, 0.5, 1.0])
+@pytest.mark.parametrize("steps", [60, 100, 500, 900, 3000, 30_000])
+def test_every_course_comes_to_large_photos_and_adds_gaussians(steps: int, share: float) -> None:
+    course = planned(changed(in_view=share), steps=steps).schedule
+    assert course.reduced_until <= max(50, steps // 3)
+    assert course.densify_from <= max(50, steps // 4)
+    assert course.densify_every <= max(40, steps // 8)
+    assert sorted(course.resolution) == list(course.resolution)
 
 
 def test_the_far_shell_keeps_its_opacities() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from splatmill_worker.splat.plan.scores import MOST_FOR_LPIPS
 from tests.support.plans.facts import changed, planned
 
 
@@ -9,6 +10,11 @@ def test_lpips_is_measured_where_it_can_be() -> None:
     plan = planned(changed())
     assert plan.lpips
     assert plan.reasons["lpips"].endswith("measured on 7 held-out photos at the end.")
+    many = changed(held_out=MOST_FOR_LPIPS + 1)
+    assert planned(changed(held_out=MOST_FOR_LPIPS)).lpips
+    assert not planned(many).lpips
+    assert "65 are held out" in planned(many).left_out["lpips"]
+    assert planned(many, lpips="on").lpips
 
 
 def test_lpips_is_left_out_with_its_reason() -> None:

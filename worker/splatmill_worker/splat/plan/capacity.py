@@ -12,6 +12,7 @@ from splatmill.schema import (
     PRESET_VISITS,
     Preset,
     TrainOptions,
+    format_bytes,
     format_duration,
     preset_steps,
 )
@@ -28,6 +29,12 @@ from splatmill_worker.splat.plan.schedule import MOST_VISITS
 
 PIXELS_PER_GAUSSIAN = 50
 """Pixels of all training photos for each Gaussian that they resolve (decisions: PIXELS_PER_GAUSSIAN)."""
+
+ROUNDED = 10**8
+"""Bytes to which the memory that the process has is rounded up."""
+
+SELDOM = 0.7
+"""`share_in_view` below which a plan says that Gaussians are added more seldom."""
 
 ASSUMED_SPEED = Speed(per_pixel=3e-8, per_gaussian=1e-7)
 """Speed of a machine that was not probed."""
@@ -100,10 +107,10 @@ def decide_densification(facts: Facts, options: TrainOptions, most: int, *, init
         because = f"Training starts with {initial} Gaussians, as many as are allowed."
     else:
         because = f"Training starts with {initial} Gaussians, and {most} are allowed."
-        if facts.coverage is not None and share_in_view(facts) < 1.0:
+        if facts.coverage is not None and share_in_view(facts) < SELDOM:
             because += (
                 f" A photo has {100 * facts.coverage.in_view:.2g} % of the points in view (median), so they are added "
-                f"{1 / share_in_view(facts):.2g} times as seldom as where it has half."
+                "more seldom: when each has been in view often enough."
             )
     return switch(options.densify, Decision(initial < most, because))
 
@@ -124,22 +131,28 @@ def _max_gaussians(
         photo_bytes = round(3 * pixels * (facts.views + facts.held_out))
         by_memory = largest_budget(options.max_memory or facts.memory_available, round(pixels), photo_bytes)
     else:
-        by_memory = (
-            Plan.gaussians_within(facts.memory_available // 2)
-            if options.max_memory is None
-            else Plan.gaussians_within(options.max_memory, facts.memory_used)
-        )
+        by_memory = _within(facts, options)
     most = min(max(by_photos, initial), by_memory)
     if options.max_gaussians is not None and options.max_gaussians <= most:
         return by_option(options.max_gaussians)
     because = {
         by_photos: f"{facts.views} photos of {round(pixels)} pixels resolve {by_photos} Gaussians. Training makes as "
         "many of them as the detail of the scene asks for.",
-        by_memory: f"Memory holds {by_memory} Gaussians.",
+        by_memory: f"Memory holds {by_memory} Gaussians beside the {format_bytes(facts.memory_used)} that the "
+        "process has already.",
     }
     return Decision(
         most, because.get(most, f"Training starts with {initial} Gaussians, more than the photos resolve.")
     )
+
+
+def _within(facts: Facts, options: TrainOptions) -> int:
+    """Gaussians that memory holds: half of what is free, or `max_memory` less what the process has, of which half at
+    least is for Gaussians. What it has is rounded, so that the same command has the same limit."""
+    if options.max_memory is None:
+        return Plan.gaussians_within(facts.memory_available // 2)
+    used = math.ceil(facts.memory_used / ROUNDED) * ROUNDED
+    return Plan.gaussians_within(options.max_memory, min(used, options.max_memory // 2))
 
 
 def _budget(

@@ -8,6 +8,7 @@ from typing import Any, Literal
 from splatmill.schema import PHOTOS_PER_VALIDATION, Background, TrainOptions
 from splatmill_worker.kernels.records import BETA2
 from splatmill_worker.splat.plan.capacity import decide_capacity, decide_densification
+from splatmill_worker.splat.plan.course import densification, resolution
 from splatmill_worker.splat.plan.facts import Facts
 from splatmill_worker.splat.plan.in_view import decide_culling, share_in_view
 from splatmill_worker.splat.plan.needs import FEW_VIEWS, needs_of
@@ -80,15 +81,16 @@ def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
     }
     explanation, gain = Explanation.of(decisions), least_gain(facts, options)
     share = share_in_view(facts)
+    densify_from, densify_every = densification(steps, share)
     shell = None if facts.coverage is None else facts.coverage.shell_distance
     return Plan(
         schedule=Schedule(
             budget=capacity.budget.value,
             longest=capacity.longest,
-            resolution=_resolution(steps, share, image_size.value) if coarse.value else ((0, 1),),
+            resolution=resolution(steps, share, image_size.value) if coarse.value else ((0, 1),),
             degree=degree.value,
-            densify_from=min(steps // 2, round(max(50, min(300, steps * share // 8)) / share)),
-            densify_every=round(max(40, min(100, steps * share // 20)) / share),
+            densify_from=densify_from,
+            densify_every=densify_every,
             densify_until=0.7,
             opacity_decay=OPACITY_DECAY if densify.value else 1.0,
             # Half way to the shell, so that all of the shell is spared and most of the scene is not.
@@ -98,9 +100,8 @@ def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
             ends_at=capacity.ends_at,
             expected_steps=steps,
             in_view=share,
-            position_scale=math.sqrt(
-                share
-            ),  # what is in view is a part of a surface (decisions: steps-in-view)
+            # What a photo has in view is a part of a surface (decisions: steps-in-view).
+            position_scale=math.sqrt(share),
         ),
         image_size=image_size.value,
         max_gaussians=most,
@@ -176,15 +177,6 @@ def _coarse_to_fine(facts: Facts, image_size: int) -> Decision[bool]:
     if image_size < 100:
         return Decision(False, f"Photos of {image_size} pixels are too small to be reduced.")
     return Decision(True, "")
-
-
-def _resolution(steps: int, share: float, image_size: int) -> tuple[tuple[int, int], ...]:
-    """Coarse to fine: a quarter of the photos' size first, then half, then all of it (decisions: coarse-to-fine)."""
-    first = round(max(20, min(200, steps * share // 8)) / share)
-    second = round(max(50, min(500, steps * share // 3)) / share)
-    if image_size < 240:
-        return ((0, 2), (second, 1))
-    return ((0, 4), (first, 2), (second, 1))
 
 
 def _degree(facts: Facts, options: TrainOptions) -> Decision[int]:

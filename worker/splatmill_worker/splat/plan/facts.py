@@ -101,8 +101,8 @@ class Facts:
     halving_loss: median RMS difference between a photo and its half-size copy enlarged again, grey levels of 255.
     reprojection: median reprojection error, pixels; without stereo points.
     memory_available: memory that this process can still use, or free memory of the GPU for the gpu kernels, bytes.
-    memory_used: resident memory of this process when the plan is made, bytes: what recovering the cameras leaves behind
-        stays, and so do photos that are not in files.
+    memory_used: memory of this process when the plan is made, without files and libraries, bytes: what recovering the
+        cameras leaves behind stays, and so do photos that are not in files.
     light: exposure and white balance of the photos; None where too few show the same points.
     geometry: None where it is not known which photos show which points.
     coverage: None without enough points, or where photos are transparent.

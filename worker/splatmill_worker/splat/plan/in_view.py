@@ -14,14 +14,13 @@ the sorting of the Gaussians at each densification by far (decisions: cluster-cu
 MANY_GAUSSIANS = 100_000
 """Number of Gaussians that a scene may have from which steps leave some out (decisions: cluster-culling)."""
 
-
 LEAST_IN_VIEW = 1e-3
 """Share of the scene that photos have in view at least: of a larger scene, half of the photos show next to nothing."""
 
 
 def share_in_view(facts: Facts) -> float:
-    """Share of the steps that have a part of the scene in view, over that of captures whose photos have half of it in
-    view or more: at most 1. The course of a run is counted in such steps (decisions: steps-in-view).
+    """How often a step has a given Gaussian in view, over how often it does where photos have half of the scene in
+    view: `in_view` over MOST_IN_VIEW, at most 1. The course of a run follows it (decisions: steps-in-view).
     """
     if facts.coverage is None:
         return 1.0

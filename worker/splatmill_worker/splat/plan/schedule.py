@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 from splatmill_worker.splat.plan.budget import Budget
+from splatmill_worker.splat.plan.course import densification
 from splatmill_worker.splat.plan.rates import Annealing
 
 MANY_VISITS = 100
@@ -38,7 +39,7 @@ class Schedule:
         of the far shell is hidden from the photos, and decay would remove it. None: no such distance.
     annealing: how the learning rates fall.
     dropout: largest share of the Gaussians that a step leaves out at random; see `left_out`.
-    in_view: share of the steps that have a part of the scene in view, over that of small captures (`share_in_view`).
+    in_view: how often a step has a given Gaussian in view, over how often it does in small captures (`share_in_view`).
     position_scale: factor on the learning rate of the positions, which is proportional to the extent of the scene: over
         that, the extent of what a photo has in view.
     earlier_visits: steps on each photo before the first of this run, for `dropout`: a tile starts from a model that has
@@ -64,14 +65,16 @@ class Schedule:
     earlier_visits: float = 0.0
 
     def seen_by(self, photos: float) -> Schedule:
-        """The schedule for a part of the scene that this share of the photos shows, 0 to 1, trained on these alone."""
-        share = min(1.0, self.in_view / photos)
-        return replace(
-            self,
-            in_view=share,
-            densify_from=round(self.densify_from * self.in_view / share),
-            densify_every=round(self.densify_every * self.in_view / share),
-        )
+        """The schedule for a part of the scene that this share of the photos shows, above 0, trained on these alone."""
+        return self.course(self.expected_steps, min(1.0, self.in_view / photos))
+
+    def course(self, steps: int, share: float) -> Schedule:
+        """The schedule with the densification of so many steps, and this share in view; where all is, it stays as it
+        is."""
+        if self.in_view == 1.0:
+            return self
+        first, every = densification(steps, share)
+        return replace(self, in_view=share, densify_from=first, densify_every=every)
 
     @property
     def reduced_until(self) -> int:

@@ -100,7 +100,9 @@ export class PlacementView {
     };
     const positions = cameras.map((camera) => poseOf(camera).position);
     const common = level(mean(positions));
-    return unit(length(common) > 0.3 * this.spread ? common : level(positions[0]), poseOf(cameras[0]).down);
+    const { down, forward } = poseOf(cameras[0]);
+    const steep = Math.abs(dot(forward, this.up)) > Math.SQRT1_2;
+    return unit(length(common) > 0.3 * this.spread ? common : level(positions[0]), steep ? down : times(forward, -1));
   }
 
   /** Look at all of it from behind the cameras and above. */

@@ -165,18 +165,19 @@ export class Pieces {
     return this.fetchedOnce(range);
   }
 
-  /** @param {number} pause  milliseconds */
+  /** Wait, but no longer than something is loaded. @param {number} pause  milliseconds */
   async wait(pause) {
-    await new Promise((resolve) => setTimeout(resolve, pause));
+    await new Promise((resolve) => {
+      const timer = setTimeout(resolve, pause);
+      this.ending.signal.addEventListener("abort", () => resolve(clearTimeout(timer)), { once: true });
+    });
   }
 
   /** @param {string} range @returns {Promise<Uint8Array>} */
   async fetchedOnce(range) {
     const failed = (/** @type {string} */ why) => new ViewerError("refused", sentence(why));
-    for (let left = 1; left > 0; ) {
-      left = this.notBefore - performance.now();
-      if (left > 0) await this.wait(left);
-    }
+    const left = this.notBefore - performance.now();
+    if (left > 0) await this.wait(left);
     if (this.ending.signal.aborted) throw failed("the view was closed");
     const patience = new Patience(this.ending.signal);
     try {
