@@ -236,9 +236,10 @@ def test_photos_are_held_at_one_size_at_a_time(
     alive: list[weakref.ref[Any]] = []
     counts = []
 
-    def watched(views: Any, size: int, *, files: PixelFiles | None) -> list[Photo]:
+    def watched(views: Any, size: int, *, files: PixelFiles | None, told: Any) -> list[Photo]:
         counts.append((size, sum(each() is not None for each in alive)))
-        photos = [replace(photo, rgb=photo.rgb.copy()) for photo in load_views(views, size, files=files)]
+        loaded = load_views(views, size, files=files, told=told)
+        photos = [replace(photo, rgb=photo.rgb.copy()) for photo in loaded]
         alive.extend(weakref.ref(photo.rgb) for photo in photos)
         return photos
 
