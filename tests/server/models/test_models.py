@@ -34,7 +34,7 @@ def test_a_model_says_what_it_is(app: ServedApp, model_id: str) -> None:
     }
     assert ply.headers["content-disposition"].startswith("attachment")
     assert [m["id"] for m in app.http.get("/v1/models").json()["models"]] == [model_id]
-    assert app.http.get(f"/v1/models/{model_id}/cameras").json() == {"cameras": []}
+    assert app.http.get(f"/v1/models/{model_id}/cameras").json() == {"cameras": [], "up": None}
     assert app.http.get(f"/v1/jobs/{model_id}/report").json()["curve"][0]["psnr"] == 27.5
     assert app.http.get(f"/v1/jobs/{model_id}/preview").content == b"\xff\xd8\xff preview"
 

@@ -72,7 +72,7 @@ def test_a_link_opens_its_model_and_nothing_else(app: ServedApp, stranger: httpx
     part = stranger.get(f"{base}/files/model.ply", headers={"Range": "bytes=0-2"})
     assert (part.status_code, part.content) == (206, b"ply")
     assert stranger.head(f"{base}/files/model.ply").headers["etag"] == own.headers["etag"]
-    assert stranger.get(f"{base}/cameras").json() == {"cameras": []}
+    assert stranger.get(f"{base}/cameras").json() == {"cameras": [], "up": None}
     for hidden in ("job.json", "frame.json", "report.json"):
         problem(stranger.get(f"{base}/files/{hidden}"), 404, "file_not_found")
     problem(stranger.get(f"{base}/files/..%2f..%2f{OTHER}%2fmodel.ply"), 404, "file_not_found")
