@@ -39,26 +39,12 @@ from splatmill_worker.tiles.stages import Context, run_unit
 run_tiles = job.run
 
 
-def run(
-    capture: Path,
-    workdir: Path,
-    options: TrainOptions,
-    emit: Emit,
-    cancelled: Callable[[], bool],
-    **more: Any,
-) -> Any:
+def run(*arguments: Any, **more: Any) -> Any:
     """Run the pipeline, and record what becomes of it."""
-    return _recorded(pipeline.run, capture, workdir, options, emit, cancelled, **more)
+    return _recorded(pipeline.run, *arguments, **more)
 
 
-def run_in_tiles(
-    capture: Path,
-    workdir: Path,
-    options: TrainOptions,
-    emit: Emit,
-    cancelled: Callable[[], bool],
-    **more: Any,
-) -> Any:
+def run_in_tiles(capture: Path, workdir: Path, *arguments: Any, **more: Any) -> Any:
     """Do the units of a scene in tiles, and record what becomes of them."""
     name = workdir.parent.name
 
@@ -74,7 +60,7 @@ def run_in_tiles(
         record(name, "unit stored", unit=output.name.rpartition("-")[0])  # NAME-DIGEST
 
     with patch.object(job, "run_unit", recorded_unit), patch.object(others, "stored", recorded_stored):
-        return _recorded(run_tiles, capture, workdir, options, emit, cancelled, **more)
+        return _recorded(run_tiles, capture, workdir, *arguments, **more)
 
 
 def _recorded(

@@ -75,7 +75,7 @@ class Room:
 def load_photos(cameras: Cameras, size: int, room: Room, emit: Emit = lambda event: None) -> Photos:
     """All photos, undistorted, with `size` pixels at most on the longer side; in files where `room` is too small.
 
-    emit: is told how many are loaded.
+    emit: called with the progress of loading, after each photo.
 
     What this and earlier stages have freed is returned to the system: decoded photos leave pieces in the heap that
     can take as much memory as the photos that are kept.

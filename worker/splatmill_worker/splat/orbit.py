@@ -83,8 +83,9 @@ def fit_path(
     cameras, it lies in front of the cameras' mean position, at three times their mean distance from there.
     """
     up = _unit(ups.mean(axis=0), np.array([0.0, 0.0, 1.0])) if up is None else up
-    known = focus is not None and _ahead(focus, centers, forwards)
-    target = focus if known and focus is not None else _nearest_to_axes(centers, forwards)
+    if focus is None or not _ahead(focus, centers, forwards):
+        focus = _nearest_to_axes(centers, forwards)
+    target = focus
     offsets = centers - target
     heights = offsets @ up
     flat = offsets - heights[:, None] * up

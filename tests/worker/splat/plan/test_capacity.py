@@ -126,6 +126,7 @@ def test_memory_bounds_the_gaussians() -> None:
     for used, left in ((0, 3000 - 350), (1010, 3000 - 1100), (2900, 1500)):
         after = planned(changed(memory_used=used * 10**6, views=900), max_memory=3 * 10**9, steps=30_000)
         assert after.max_gaussians == left * 10**6 // BYTES_PER_GAUSSIAN
+        assert ("that the process has" in after.reasons["max_gaussians"]) == (used > 0)
 
 
 def test_more_gaussians_asked_for_never_cut_those_at_the_start() -> None:

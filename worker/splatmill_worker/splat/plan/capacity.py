@@ -135,11 +135,12 @@ def _max_gaussians(
     most = min(max(by_photos, initial), by_memory)
     if options.max_gaussians is not None and options.max_gaussians <= most:
         return by_option(options.max_gaussians)
+    counts = options.max_memory is not None and kernels != "gpu" and facts.memory_used > 0
+    beside = f" beside the {format_bytes(facts.memory_used)} that the process has already" if counts else ""
     because = {
         by_photos: f"{facts.views} photos of {round(pixels)} pixels resolve {by_photos} Gaussians. Training makes as "
         "many of them as the detail of the scene asks for.",
-        by_memory: f"Memory holds {by_memory} Gaussians beside the {format_bytes(facts.memory_used)} that the "
-        "process has already.",
+        by_memory: f"Memory holds {by_memory} Gaussians{beside}.",
     }
     return Decision(
         most, because.get(most, f"Training starts with {initial} Gaussians, more than the photos resolve.")

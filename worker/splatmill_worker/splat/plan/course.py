@@ -1,9 +1,9 @@
 """When photos become larger and Gaussians are added: counted in steps that have a Gaussian in view.
 
 `share` is how often a step has a given Gaussian in view, over how often it does where photos have half of the scene in
-view: 0 to 1 (`share_in_view`). So many captures side by side, trained together for as many times the steps, have the
-course of one (decisions: steps-in-view). Each number has a limit by the steps alone, for runs that show too little of a
-scene and for forecasts that are wrong.
+view: 0 to 1 (`share_in_view`). Two captures side by side, trained together for twice the steps, then have the course
+that each has alone (decisions: steps-in-view). Each number has a limit by the steps alone, for runs that show too
+little of a scene and for forecasts that are wrong.
 """
 
 from __future__ import annotations
