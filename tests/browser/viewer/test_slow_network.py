@@ -7,6 +7,7 @@ Bytes are counted here and times are not.
 from __future__ import annotations
 
 import io
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,8 @@ FIRST_FRAME = 600_000
 PICTURE = {"link": 60_000, "frame": 60_000, "model": 152_000}
 """Most bytes until the picture is seen. Links come with it; the model's page has to learn first what the model has."""
 
+FLAT = 0.02
+"""Least standard deviation of what shows the scene; an empty view has none."""
 
 DRAWN = "() => Number(document.querySelector('.view')?.dataset.frames) > 0 && !document.querySelector('.view img')"
 """Whether the scene is drawn and its picture gone."""
@@ -58,7 +61,7 @@ def slowed(visit: Visit, conditions: dict[str, Any]) -> list[int]:
 
 @pytest.mark.parametrize("where", ["link", "frame", "model"])
 def test_the_picture_comes_first_and_the_scene_from_few_bytes(
-    service: Up, model: SmallModel, open_window: Open, where: str
+    service: Up, model: SmallModel, open_window: Open, where: str, tmp_path: Path
 ) -> None:
     service.http.get(f"/v1/models/{model.id}/download/sog", timeout=60)
     link = service.http.post(f"/v1/models/{model.id}/shares", json={"expires_in": "1h"}).json()["path"]
@@ -73,13 +76,27 @@ def test_the_picture_comes_first_and_the_scene_from_few_bytes(
     seen = f"[...document.querySelectorAll('{box} img')].some((img) => img.complete && img.naturalWidth > 0)"
     page.wait_for_function(f"() => {seen}", polling=50)
     assert sum(loaded) < PICTURE[where], "the picture comes before the engine"
-    poster = inner(page.locator(box))
+    # A picture that has come is shown once it is decoded.
+    (poster,) = wait_for(lambda: [view for view in [inner(page.locator(box))] if view.std() > FLAT])
     expect(page.locator(".view .said")).to_contain_text("Loading")
     page.wait_for_function(DRAWN, polling=50)
     assert sum(loaded) < FIRST_FRAME
     expect(page.locator(".view .said")).to_be_empty()
     # A frame that was drawn is shown a moment later.
-    wait_for(lambda: -10 * np.log10(np.square(inner(page.locator(box)) - poster).mean()) > 25)
+    alike: list[float] = []
+
+    def like_the_picture() -> bool:
+        alike.append(float(-10 * np.log10(np.square(inner(page.locator(box)) - poster).mean())))
+        return alike[-1] > 25
+
+    try:
+        wait_for(like_the_picture)
+    except AssertionError as error:
+        Image.fromarray((255 * poster).astype(np.uint8)).save(tmp_path / "poster.png")
+        page.screenshot(path=tmp_path / "view.png")
+        raise AssertionError(
+            f"the view is like its picture by {alike[0]:.1f} dB, later {alike[-1]:.1f}; {tmp_path}"
+        ) from error
     assert not [line for line in asked if line.endswith("/model.ply")]
 
 
