@@ -297,9 +297,7 @@ class TrainOptions(Request):
         default=Mapper.auto,
         description=(
             "Method that recovers the cameras: incremental adds one photo after another, global solves for "
-            "all at once. With auto, the number of photos and of matching pairs decides, and the "
-            "other method "
-            "is tried if too few photos can be placed."
+            "all at once. With auto, incremental is used, and global is tried if too few photos can be placed."
         ),
         json_schema_extra=_CAMERAS,
     )

@@ -99,22 +99,6 @@ def test_no_other_mapper_is_tried_for_photos_that_nothing_connects(
 
 
 @pytest.mark.parametrize(
-    ("count", "pairs_each", "first"),
-    [
-        (trials.GLOBAL_MIN_PHOTOS - 1, trials.GLOBAL_MIN_DEGREE, "incremental"),
-        (trials.GLOBAL_MIN_PHOTOS, trials.GLOBAL_MIN_DEGREE, "global"),
-        (trials.GLOBAL_MIN_PHOTOS, trials.GLOBAL_MIN_DEGREE - 1, "incremental"),
-    ],
-)
-def test_the_global_mapper_is_first_for_many_photos_in_a_dense_graph(
-    count: int, pairs_each: int, first: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    ring = [(photo, (photo + step) % count) for photo in range(count) for step in range(1, pairs_each + 1)]
-    verified = [(min(pair), max(pair)) for pair in ring]
-    assert _tried(count, verified, count, tmp_path, monkeypatch) == [(first, False)]
-
-
-@pytest.mark.parametrize(
     ("registered", "again", "called", "kept"),
     [(5, 6, "extended", 6), (5, 4, "extended", 5), (4, 9, "anew", 9), (4, 3, "anew", 4)],
     ids=["more", "fewer", "less than half, more", "less than half, fewer"],

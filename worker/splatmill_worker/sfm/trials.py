@@ -12,12 +12,6 @@ from splatmill_worker.sfm.run import SfmRun
 ENOUGH_REGISTERED = 0.9
 """Share of the photos that the view graph connects, reliably registered, from which no other mapper is tried."""
 
-GLOBAL_MIN_PHOTOS = 1000
-"""Photos from which the global mapper is tried first, where the view graph is dense (decisions: GLOBAL_MIN_PHOTOS)."""
-
-GLOBAL_MIN_DEGREE = 5
-"""Verified pairs per photo from which a view graph counts as dense."""
-
 
 def registered_counts(mapped: mapper.Mapped | None) -> tuple[int, int]:
     """Number of photos registered reliably in the largest model, and number of all those registered in it."""
@@ -27,7 +21,8 @@ def registered_counts(mapped: mapper.Mapped | None) -> tuple[int, int]:
 
 
 def best_mapping(run: SfmRun, database: Path, verified: Collection[pairs.Pair]) -> mapper.Mapped:
-    """The best of up to three mappings: with the likelier mapper, with the other one, and with relaxed settings.
+    """The best of up to three mappings: with one mapper, with the other one, and with relaxed settings. The incremental
+    one is the first (decisions: first-mapper), unless the other has placed more photos of the run before.
 
     No mapper registers photos that the view graph does not connect, so the next one is not tried where the last
     registered ENOUGH_REGISTERED of the photos that are connected.
@@ -41,8 +36,6 @@ def best_mapping(run: SfmRun, database: Path, verified: Collection[pairs.Pair]) 
         first = asked
     elif run.best_mapper is not None:
         first = run.best_mapper
-    elif run.count >= GLOBAL_MIN_PHOTOS and len(verified) >= GLOBAL_MIN_DEGREE * run.count:
-        first = "global"
     trials: list[tuple[mapper.Mapper, bool]] = [(first, False)]
     if asked == "auto":
         trials.append(("global" if first == "incremental" else "incremental", False))
