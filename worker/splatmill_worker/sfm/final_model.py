@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +15,8 @@ from splatmill_worker.sfm.cameras import CameraGroup
 from splatmill_worker.sfm.effort import registered_photos
 from splatmill_worker.sfm.mapping import adjust, mapper
 from splatmill_worker.sfm.run import EffortResult, SfmRun
+from splatmill_worker.sfm.world.frame import places_of
+from splatmill_worker.sfm.world.position_priors import position_priors
 
 
 @dataclass(frozen=True)
@@ -98,7 +101,29 @@ def _with_plausible_intrinsics(
 def _adjusted(
     run: SfmRun, model: pycolmap.Reconstruction, fixed: bool
 ) -> tuple[pycolmap.Reconstruction, tuple[str, ...]]:
-    """The model after the last bundle adjustment, and warnings about its lenses."""
+    """The model after the last bundle adjustment, in which GPS takes part, and warnings about its lenses."""
+    photos = {
+        image_id: run.prepared.photos[features.photo_index(model.images[image_id].name)]
+        for image_id in model.reg_image_ids()
+    }
+    places = places_of([photo.exif for photo in photos.values()])
+    held = position_priors(model, dict(zip(photos, places, strict=True)))
+    if held is None:
+        return _solved(run, model, fixed, ())
+    run.notes.append(
+        f"The positions of {len(held.priors)} photos by GPS, which agree within {held.error:.1f} m, took part in the "
+        "last adjustment of the cameras."
+    )
+    model.transform(held.to_metres)
+    model, warnings = _solved(run, model, fixed, held.priors)
+    model.transform(held.to_metres.inverse())
+    return model, warnings
+
+
+def _solved(
+    run: SfmRun, model: pycolmap.Reconstruction, fixed: bool, priors: Sequence[pycolmap.PosePrior]
+) -> tuple[pycolmap.Reconstruction, tuple[str, ...]]:
+    """The model after an adjustment with `priors`, in its world, and warnings about its lenses."""
     placed = model.num_reg_images()
 
     def report(iterations: int) -> None:
@@ -108,7 +133,12 @@ def _adjusted(
 
     if fixed or run.options.camera_model != "auto":
         adjust.bundle_adjust(
-            model, run.threads, fixed_intrinsics=fixed, cancelled=run.cancelled, on_iterations=report
+            model,
+            run.threads,
+            fixed_intrinsics=fixed,
+            priors=priors,
+            cancelled=run.cancelled,
+            on_iterations=report,
         )
         return model, ()
     adjust.use_opencv_fisheye(model)
@@ -123,9 +153,9 @@ def _adjusted(
         if not group.is_panorama and not group.is_fisheye
     }
     if not initial:
-        adjust.bundle_adjust(model, run.threads, cancelled=run.cancelled, on_iterations=report)
+        adjust.bundle_adjust(model, run.threads, priors=priors, cancelled=run.cancelled, on_iterations=report)
         return model, ()
-    adjusted = adjust.adjust_with_lenses(model, initial, run.threads, run.cancelled, report)
+    adjusted = adjust.adjust_with_lenses(model, initial, run.threads, run.cancelled, report, priors)
     if adjusted.tied:
         run.notes.append(
             "The photos do not determine whether the lens stretches them, since the camera moved along a line, around "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -64,6 +64,7 @@ def adjust_with_lenses(
     threads: int,
     cancelled: Callable[[], bool],
     on_iterations: Callable[[int], None] = lambda done: None,
+    priors: Sequence[pycolmap.PosePrior] = (),
 ) -> Adjusted:
     """Adjust all poses and points, and of each SIMPLE_RADIAL camera the parameters that its photos determine.
 
@@ -75,8 +76,11 @@ def adjust_with_lenses(
     model: is not changed.
     initial: focal length that a camera had before any photo was matched, in pixels, by its id.
     on_iterations: as that of `bundle_adjust`, which is called up to three times.
+    priors: as those of `bundle_adjust`.
     """
-    adjust = partial(bundle_adjust, threads=threads, cancelled=cancelled, on_iterations=on_iterations)
+    adjust = partial(
+        bundle_adjust, threads=threads, priors=priors, cancelled=cancelled, on_iterations=on_iterations
+    )
     model = registered(model)  # the covariance needs the pose of every photo
     rich = _well_observed(model, "SIMPLE_RADIAL")
     tied: set[int] = set()
@@ -194,6 +198,7 @@ def bundle_adjust(
     *,
     fixed_intrinsics: bool = False,
     fixed_focal: bool = False,
+    priors: Sequence[pycolmap.PosePrior] = (),
     cancelled: Callable[[], bool],
     on_iterations: Callable[[int], None] = lambda done: None,
 ) -> pycolmap.CeresBundleAdjuster:
@@ -201,9 +206,11 @@ def bundle_adjust(
 
     fixed_intrinsics: keep focal lengths and distortion.
     fixed_focal: keep focal lengths.
+    priors: positions of photos that are observations too, in the world of `model`.
     on_iterations: called with the number of iterations so far, every few seconds in a large model.
 
-    Returns the solved problem. Raises Cancelled between iterations, as often, when the caller has asked to stop.
+    Returns the solved problem, without the priors. Raises Cancelled between iterations, as often, when the caller has
+    asked to stop.
     """
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_principal_point = False
@@ -221,12 +228,33 @@ def bundle_adjust(
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     at_once = iterations_at_once(model, MAX_ITERATIONS)
     options.ceres.solver_options.max_num_iterations = at_once
-    adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
+    adjuster = None
     for done in range(0, MAX_ITERATIONS, at_once):
         on_iterations(done)
         stop_if(cancelled)
+        if priors:
+            # This problem has a world of its own, which COLMAP leaves when it is solved.
+            adjuster = _held_by(priors, options, model)
+        elif adjuster is None:
+            adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
         if adjuster.solve().termination_type != pycolmap.BundleAdjustmentTerminationType.NO_CONVERGENCE:
             break
     model.update_point_3d_errors()
     stop_if(cancelled)
+    if priors or adjuster is None:
+        adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
     return adjuster
+
+
+def _held_by(
+    priors: Sequence[pycolmap.PosePrior],
+    options: pycolmap.BundleAdjustmentOptions,
+    model: pycolmap.Reconstruction,
+) -> pycolmap.CeresBundleAdjuster:
+    """The problem of an adjustment of all photos with `priors`, which fix its gauge."""
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in model.reg_image_ids():
+        config.add_image(image_id)
+    held = pycolmap.PosePriorBundleAdjustmentOptions()
+    held.alignment_ransac.random_seed = 0
+    return pycolmap.create_pose_prior_ceres_bundle_adjuster(options, held, config, list(priors), model)

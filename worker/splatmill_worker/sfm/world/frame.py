@@ -120,7 +120,7 @@ def require_photos(known: KnownDistance | None, names: Sequence[str]) -> None:
 def _down(scene: Scene, tags: Sequence[Exif]) -> Down:
     """Down by the photos, or by GPS where that is in doubt and GPS determines it."""
     down = down_of(np.array([view.camera.viewmat[:3, :3] for view in scene.views]))
-    places = _places(tags)
+    places = places_of(tags)
     known = np.isfinite(places).all(axis=1)
     if down.doubt is None or not known.any():
         return down
@@ -168,7 +168,7 @@ def _located(level: Scene, tags: Sequence[Exif]) -> tuple[Similarity, Geographic
 
     With it, where that point lies, and why the origin and the unit are known; else why not, as the end of a sentence.
     """
-    places = _places(tags)
+    places = places_of(tags)
     known = np.isfinite(places[:, :2]).all(axis=1)
     if not known.any():
         return "the photos have no positions"
@@ -202,7 +202,7 @@ def _located(level: Scene, tags: Sequence[Exif]) -> tuple[Similarity, Geographic
     )
 
 
-def _places(tags: Sequence[Exif]) -> Float:
+def places_of(tags: Sequence[Exif]) -> Float:
     """Latitude, longitude and altitude of each photo [n,3], NaN where it is not known."""
     rows = [
         [np.nan if value is None else value for value in (tag.latitude, tag.longitude, tag.altitude)]

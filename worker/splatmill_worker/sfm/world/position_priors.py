@@ -1,0 +1,64 @@
+"""Positions by GPS as observations of an adjustment: they hold the shape of a large scene where photos alone hardly do.
+
+Photos of a wide, flat scene leave a bulge of all of it nearly free: a slightly wrong lens explains it (James and
+Robson, "Mitigating systematic error in topographic models derived from UAV and ground-based image networks", 2014).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from splatmill_worker.colmap import pycolmap
+from splatmill_worker.scene import Float
+from splatmill_worker.sfm.world import geodesy, georeference
+
+ALIKE = 30
+"""Photos that share an error of GPS, which changes over minutes: so much less each of them counts (decisions:
+position-priors)."""
+
+
+@dataclass(frozen=True)
+class PositionPriors:
+    """Where the photos of a model were by GPS.
+
+    to_metres: from the world of the model to metres to the east, to the north and upwards.
+    priors: of each photo whose position agrees with the others, in those metres.
+    error: standard deviation of a coordinate of one of them, in metres.
+    """
+
+    to_metres: pycolmap.Sim3d
+    priors: tuple[pycolmap.PosePrior, ...]
+    error: float
+
+
+def position_priors(model: pycolmap.Reconstruction, places: Mapping[int, Float]) -> PositionPriors | None:
+    """The priors of the registered photos of `model`; None where their positions do not fit its cameras.
+
+    places: latitude and longitude in degrees and altitude in metres, float64 [3], of each photo by its image's id; not
+        finite where the photo has none.
+    """
+    known = sorted(image for image in model.reg_image_ids() if np.isfinite(places[image]).all())
+    if not known:
+        return None
+    measured = np.array([places[image] for image in known])
+    metres = geodesy.local(measured, np.median(measured, axis=0))
+    centers = np.array([model.images[image].projection_center() for image in known])
+    found = georeference.fit(centers, metres)
+    if isinstance(found, str):
+        return None
+    covariance = ALIKE * found.error**2 * np.eye(3)
+    priors = tuple(
+        pycolmap.PosePrior(
+            corr_data_id=model.images[image].data_id,
+            position=place,
+            position_covariance=covariance,
+            coordinate_system=pycolmap.PosePriorCoordinateSystem.CARTESIAN,
+        )
+        for image, place, agrees in zip(known, metres, found.agreeing, strict=True)
+        if agrees
+    )
+    turn = pycolmap.Rotation3d(found.rotation)
+    return PositionPriors(pycolmap.Sim3d(found.scale, turn, found.translation), priors, found.error)
