@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +17,13 @@ from splatmill_worker.sfm.mapping import adjust, mapper
 from splatmill_worker.sfm.run import EffortResult, SfmRun
 from splatmill_worker.sfm.world.frame import places_of
 from splatmill_worker.sfm.world.position_priors import position_priors
+
+MORE_WITH_GPS = 2
+"""Adjustments that follow the first one with GPS, at most."""
+
+BETTER = 0.8
+"""Share of the error of GPS before an adjustment, as the cameras show it, below which another one follows: part of the
+error was that of the cameras, and GPS counted for too little."""
 
 
 @dataclass(frozen=True)
@@ -101,36 +108,52 @@ def _with_plausible_intrinsics(
 def _adjusted(
     run: SfmRun, model: pycolmap.Reconstruction, fixed: bool
 ) -> tuple[pycolmap.Reconstruction, tuple[str, ...]]:
-    """The model after the last bundle adjustment, in which GPS takes part, and warnings about its lenses."""
+    """The model after the last bundle adjustment, in which GPS takes part, and warnings about its lenses.
+
+    `model` itself is used up. Where an adjustment makes the photos agree much better with GPS, another one follows, in
+    which GPS counts for as much more.
+    """
     photos = {
         image_id: run.prepared.photos[features.photo_index(model.images[image_id].name)]
         for image_id in model.reg_image_ids()
     }
-    places = places_of([photo.exif for photo in photos.values()])
-    held = position_priors(model, dict(zip(photos, places, strict=True)))
-    if held is None:
+    rows = places_of([photo.exif for photo in photos.values()])
+    places = dict(zip(photos, rows, strict=True))
+    gps = position_priors(model, places)
+    if gps is None:
         return _solved(run, model, fixed, ())
+    to_metres = gps.to_metres
+    model.transform(to_metres)
+    model, warnings = _solved(run, model, fixed, gps.priors)
+    for _ in range(MORE_WITH_GPS):
+        again = position_priors(model, places)
+        if again is None or again.error >= BETTER * gps.error:
+            break
+        gps = again
+        model.transform(gps.to_metres)
+        to_metres = gps.to_metres * to_metres
+        adjust.bundle_adjust(
+            model,
+            run.threads,
+            fixed_intrinsics=fixed,
+            fixed_focal=bool(warnings),
+            priors=gps.priors,
+            cancelled=run.cancelled,
+            on_iterations=_reporter(run, model),
+        )
+    model.transform(to_metres.inverse())
     run.notes.append(
-        f"The positions of {len(held.priors)} photos by GPS, which agree within {held.error:.1f} m, took part in the "
-        "last adjustment of the cameras."
+        f"GPS took part in the last adjustment of the cameras, by the positions of {len(gps.priors)} photos with an "
+        f"error of about {gps.error:.1f} m."
     )
-    model.transform(held.to_metres)
-    model, warnings = _solved(run, model, fixed, held.priors)
-    model.transform(held.to_metres.inverse())
     return model, warnings
 
 
 def _solved(
     run: SfmRun, model: pycolmap.Reconstruction, fixed: bool, priors: Sequence[pycolmap.PosePrior]
 ) -> tuple[pycolmap.Reconstruction, tuple[str, ...]]:
-    """The model after an adjustment with `priors`, in its world, and warnings about its lenses."""
-    placed = model.num_reg_images()
-
-    def report(iterations: int) -> None:
-        run.on_mapping(
-            placed, run.count, f"adjusting {placed} cameras and their lenses, iteration {iterations + 1}"
-        )
-
+    """The model after a bundle adjustment, and warnings about its lenses. `priors` are in the world of `model`."""
+    report = _reporter(run, model)
     if fixed or run.options.camera_model != "auto":
         adjust.bundle_adjust(
             model,
@@ -162,6 +185,18 @@ def _solved(
             "one axis or over a flat scene. Its pixels are assumed to be square, and its distortion radial."
         )
     return adjusted.model, tuple(_assumption(groups[camera]) for camera in sorted(adjusted.assumed))
+
+
+def _reporter(run: SfmRun, model: pycolmap.Reconstruction) -> Callable[[int], None]:
+    """Reports the iterations of an adjustment of `model`."""
+    placed = model.num_reg_images()
+
+    def report(iterations: int) -> None:
+        run.on_mapping(
+            placed, run.count, f"adjusting {placed} cameras and their lenses, iteration {iterations + 1}"
+        )
+
+    return report
 
 
 def _assumption(group: CameraGroup) -> str:

@@ -136,7 +136,7 @@ export class View extends EventTarget {
     this.overlay = new Overlay(over);
     this.poster = document.createElement("img");
     this.poster.alt = "";
-    this.poster.decoding = "sync"; // the page may have shown it already: it is there in the first frame of the view
+    this.poster.decoding = "sync"; // decoded later, it would leave the view empty for a frame after the page's own copy of it
     this.poster.addEventListener("error", () => this.poster.remove());
     /** What of the model is missing, in words. */
     this.warning = "";

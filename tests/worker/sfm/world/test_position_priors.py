@@ -8,13 +8,19 @@ real receivers are alike: `decisions.md` says what was tried (position-priors).
 from __future__ import annotations
 
 import copy
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from splatmill_worker.colmap import pycolmap
+from splatmill_worker.images.exif import Exif
+from splatmill_worker.sfm import final_model
+from splatmill_worker.sfm.cameras import CameraGroup
 from splatmill_worker.sfm.mapping import adjust
 from splatmill_worker.sfm.mapping.adjust import Deviations, adjust_with_lenses, bundle_adjust
+from splatmill_worker.sfm.options import SfmOptions
 from splatmill_worker.sfm.world import geodesy
 from splatmill_worker.sfm.world.georeference import umeyama
 from splatmill_worker.sfm.world.position_priors import position_priors
@@ -32,7 +38,7 @@ UNIT = 250.0
 TURN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
-def flight() -> tuple[pycolmap.Reconstruction, Float]:
+def flight(curvature: float) -> tuple[pycolmap.Reconstruction, Float]:
     """A model that a bulge has got into, as a mapper leaves it, and the true places of its photos in metres."""
     rng = np.random.default_rng(0)
     side = ROWS * STEP
@@ -42,7 +48,7 @@ def flight() -> tuple[pycolmap.Reconstruction, Float]:
     centers += rng.normal(0.0, 5.0, centers.shape)
 
     def bulged(places: Float) -> Float:
-        above = 2e-6 * ((places[:, :2] - side / 2) ** 2).sum(axis=1)
+        above = curvature * ((places[:, :2] - side / 2) ** 2).sum(axis=1)
         there: Float = (places + above[:, None] * [0.0, 0.0, 1.0]) @ TURN.T / UNIT
         return there
 
@@ -81,11 +87,6 @@ def flight() -> tuple[pycolmap.Reconstruction, Float]:
     return model, centers
 
 
-def told(metres: Float) -> dict[int, Float]:
-    """What the EXIF of the photos says of places in metres, by the ids of their images."""
-    return {number + 1: geodesy.place(place, LUND) for number, place in enumerate(metres)}
-
-
 def centers_of(model: pycolmap.Reconstruction) -> Float:
     return np.array([model.images[image].projection_center() for image in sorted(model.reg_image_ids())])
 
@@ -100,21 +101,37 @@ def error(model: pycolmap.Reconstruction, truth: Float) -> float:
     )
 
 
-def held(model: pycolmap.Reconstruction, places: dict[int, Float]) -> pycolmap.Reconstruction:
-    found = position_priors(model, places)
-    assert found is not None
-    model = copy.deepcopy(model)
-    model.transform(found.to_metres)
-    adjusted = adjust_with_lenses(model, {1: FOCAL}, 2, lambda: False, priors=found.priors).model
-    adjusted.transform(found.to_metres.inverse())
-    return adjusted
+def adjusted(
+    model: pycolmap.Reconstruction, metres: Float, heights: Float | None = None, *, fixed: bool = False
+) -> tuple[pycolmap.Reconstruction, list[str]]:
+    """The final model of photos whose EXIF has these places, and the notes.
+
+    heights: altitudes that it has in place of the true ones; NaN: none.
+    """
+    places = np.array([geodesy.place(place, LUND) for place in metres])
+    if heights is not None:
+        places[:, 2] = heights
+    photos = [
+        SimpleNamespace(exif=Exif(latitude=a, longitude=b, altitude=None if np.isnan(c) else c))
+        for a, b, c in places
+    ]
+    group = CameraGroup(tuple(range(len(photos))), WIDTH, HEIGHT, FOCAL / WIDTH, known=True)
+    reports: list[str] = []
+    run: Any = SimpleNamespace(
+        prepared=SimpleNamespace(photos=photos), groups=[group], options=SfmOptions(), threads=1, notes=[],
+        count=len(photos), cancelled=lambda: False, on_mapping=lambda done, total, note: reports.append(note),
+    )  # fmt: skip
+    model, warnings = final_model._adjusted(run, copy.deepcopy(model), fixed)
+    assert reports
+    assert not warnings
+    return model, run.notes
 
 
 @pytest.fixture(scope="module")
 def flown() -> tuple[pycolmap.Reconstruction, Float, float]:
     """The model, the true places, and the error of the model when it is adjusted without GPS."""
-    model, truth = flight()
-    plain = adjust_with_lenses(model, {1: FOCAL}, 2, lambda: False).model
+    model, truth = flight(2e-6)
+    plain = adjust_with_lenses(model, {1: FOCAL}, 1, lambda: False).model
     assert plain.compute_mean_reprojection_error() < 0.5
     return model, truth, error(plain, truth)
 
@@ -124,62 +141,102 @@ GPS = {
     "each its own error": np.random.default_rng(1).normal(0.0, 2.0, (ROWS * ROWS, 3)),
     "one error for a strip": np.repeat(np.random.default_rng(1).normal(0.0, 2.0, (ROWS, 3)), ROWS, axis=0),
 }
+MEASURED = GPS["each its own error"]
 
 
 @pytest.mark.parametrize("noise", GPS)
 def test_a_bulge_goes(flown: Flown, noise: str) -> None:
     model, truth, without = flown
-    adjusted = held(model, told(truth + GPS[noise]))
+    result, notes = adjusted(model, truth + GPS[noise])
     assert without > 3.0
-    assert error(adjusted, truth) < 0.5 * without
-    assert adjusted.compute_mean_reprojection_error() < 0.5
+    assert error(result, truth) < 0.5 * without
+    assert result.compute_mean_reprojection_error() < 0.5
     # It is where it was, in its own unit, and not where GPS has it.
-    assert np.abs(centers_of(adjusted) - centers_of(model)).max() < 10.0 / UNIT
+    assert np.abs(centers_of(result) - centers_of(model)).max() < 10.0 / UNIT
+    assert [note for note in notes if note.startswith("GPS took part") and "of 144 photos" in note]
+
+
+def test_a_bulge_larger_than_the_error_of_gps_goes_too(flown: Flown) -> None:
+    """It makes GPS seem to be off by more, so that it counts for too little at first."""
+    model, truth = flight(2e-5)
+    result, _ = adjusted(model, truth + MEASURED)
+    assert error(model, truth) > 10.0
+    assert error(result, truth) < 0.5 * flown[2]
 
 
 def test_the_same_photos_give_the_same_cameras(flown: Flown) -> None:
     model, truth, _ = flown
-    places = told(truth + GPS["each its own error"])
-    np.testing.assert_allclose(centers_of(held(model, places)), centers_of(held(model, places)), atol=1e-9)
+    first, second = (adjusted(model, truth + MEASURED)[0] for _ in range(2))
+    np.testing.assert_allclose(centers_of(first), centers_of(second), atol=1e-9)
 
 
 def test_many_calls_of_the_solver_end_where_one_does(flown: Flown, monkeypatch: pytest.MonkeyPatch) -> None:
     model, truth, without = flown
+    whole, _ = adjusted(model, truth + MEASURED)
     monkeypatch.setattr(adjust, "ITERATED_OBSERVATIONS", 1)
-    adjusted = held(model, told(truth + GPS["each its own error"]))
-    assert error(adjusted, truth) < 0.5 * without
+    parts, _ = adjusted(model, truth + MEASURED)
+    assert np.abs(centers_of(whole) - centers_of(parts)).max() < 0.1 * without / UNIT
 
 
-def test_wrong_positions_take_no_part(flown: Flown) -> None:
+def test_photos_without_a_pose_or_an_altitude_and_with_a_wrong_position_take_no_part(flown: Flown) -> None:
     model, truth, without = flown
-    measured = truth + GPS["each its own error"]
-    wrong = np.arange(0, len(truth), 12)
-    measured[wrong] += [300.0, -200.0, 80.0]
-    found = position_priors(model, told(measured))
-    assert found is not None
-    assert len(found.priors) == len(truth) - len(wrong)
-    assert not {int(prior.corr_data_id.id) for prior in found.priors} & set(wrong + 1)
-    assert error(held(model, told(measured)), truth) < 0.5 * without
+    measured, heights = truth + MEASURED, LUND[2] + truth[:, 2] + MEASURED[:, 2]
+    measured[::13] += [300.0, -200.0, 80.0]
+    heights[1::13] = np.nan
+    some = copy.deepcopy(model)
+    for number in range(2, len(truth), 13):
+        some.deregister_frame(some.images[number + 1].frame_id)
+    result, notes = adjusted(some, measured, heights)
+    registered = [image - 1 for image in sorted(result.reg_image_ids())]
+    assert len(registered) == len(truth) - 11
+    assert [note for note in notes if "of 110 photos" in note]
+    assert error(result, truth[registered]) < 0.5 * without
 
 
-def test_there_are_none_where_gps_does_not_fit_or_has_no_height(flown: Flown) -> None:
+NO_GPS = {
+    "anywhere": lambda truth: (np.random.default_rng(2).uniform(0.0, 2000.0, truth.shape), None),
+    "without altitudes": lambda truth: (truth, np.full(len(truth), np.nan)),
+    "with one altitude": lambda truth: (truth, np.zeros(len(truth))),
+    "of a few": lambda truth: (truth, np.where(np.arange(len(truth)) < 50, LUND[2] + truth[:, 2], np.nan)),
+}
+
+
+@pytest.mark.parametrize("case", NO_GPS)
+def test_positions_that_say_too_little_take_no_part(flown: Flown, case: str) -> None:
+    model, truth, without = flown
+    result, notes = adjusted(model, *NO_GPS[case](truth))
+    assert error(result, truth) == pytest.approx(without, rel=1e-3)
+    assert not notes
+
+
+def test_positions_along_a_line_take_no_part(flown: Flown) -> None:
     model, truth, _ = flown
-    anywhere = np.random.default_rng(2).uniform(0.0, 2000.0, truth.shape)
-    assert position_priors(model, told(anywhere)) is None
-    flat = {image: place * [1.0, 1.0, np.nan] for image, place in told(truth).items()}
-    assert position_priors(model, flat) is None
-    few = {image: place if image <= 4 else place * np.nan for image, place in told(truth).items()}
-    assert position_priors(model, few) is None
+    line = copy.deepcopy(model)
+    for number in range(ROWS, len(truth)):
+        line.deregister_frame(line.images[number + 1].frame_id)
+    places = {number + 1: geodesy.place(place, LUND) for number, place in enumerate(truth + MEASURED)}
+    assert position_priors(line, places) is None
+    assert position_priors(model, places) is not None
 
 
-def test_the_doubt_about_a_lens_is_that_without_gps(flown: Flown) -> None:
-    """GPS holds the cameras' places; whether photos determine their lens is judged by the photos."""
+def test_intrinsics_that_are_fixed_stay(flown: Flown) -> None:
     model, truth, _ = flown
-    found = position_priors(model, told(truth))
-    assert found is not None
+    result, _ = adjusted(model, truth + MEASURED, fixed=True)
+    np.testing.assert_array_equal(result.cameras[1].params, model.cameras[1].params)
+    assert error(result, truth) < 3.0
+
+
+def test_whether_photos_determine_their_lens_is_judged_without_gps(flown: Flown) -> None:
+    model, truth, _ = flown
+    places = {number + 1: geodesy.place(place, LUND) for number, place in enumerate(truth)}
+    gps = position_priors(model, places)
+    assert gps is not None
     moved = copy.deepcopy(model)
-    moved.transform(found.to_metres)
-    with_gps = Deviations.of(moved, bundle_adjust(moved, 2, priors=found.priors, cancelled=lambda: False))
+    moved.transform(gps.to_metres)
+    observations = moved.compute_num_observations()
+    solved = bundle_adjust(moved, 1, priors=gps.priors, cancelled=lambda: False)
+    with_gps = Deviations.of(moved, solved)
     alone = copy.deepcopy(model)
-    without_gps = Deviations.of(alone, bundle_adjust(alone, 2, cancelled=lambda: False))
+    without_gps = Deviations.of(alone, bundle_adjust(alone, 1, cancelled=lambda: False))
     assert with_gps.focal(moved.cameras[1]) == pytest.approx(without_gps.focal(alone.cameras[1]), rel=0.05)
+    assert solved.solve().num_residuals == 2 * observations

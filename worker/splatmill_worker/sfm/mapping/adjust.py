@@ -233,8 +233,9 @@ def bundle_adjust(
         on_iterations(done)
         stop_if(cancelled)
         if priors:
-            # This problem has a world of its own, which COLMAP leaves when it is solved.
-            adjuster = _held_by(priors, options, model)
+            # COLMAP shifts the model when it builds this problem and back when it has solved it, so only once.
+            adjuster = None  # the last one is freed before the next is built
+            adjuster = _problem_with(priors, options, model)
         elif adjuster is None:
             adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
         if adjuster.solve().termination_type != pycolmap.BundleAdjustmentTerminationType.NO_CONVERGENCE:
@@ -242,19 +243,22 @@ def bundle_adjust(
     model.update_point_3d_errors()
     stop_if(cancelled)
     if priors or adjuster is None:
+        adjuster = None
         adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
     return adjuster
 
 
-def _held_by(
+def _problem_with(
     priors: Sequence[pycolmap.PosePrior],
     options: pycolmap.BundleAdjustmentOptions,
     model: pycolmap.Reconstruction,
 ) -> pycolmap.CeresBundleAdjuster:
-    """The problem of an adjustment of all photos with `priors`, which fix its gauge."""
+    """The problem of an adjustment of all photos with `priors`, which take the place of a fixed gauge."""
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in model.reg_image_ids():
         config.add_image(image_id)
-    held = pycolmap.PosePriorBundleAdjustmentOptions()
-    held.alignment_ransac.random_seed = 0
-    return pycolmap.create_pose_prior_ceres_bundle_adjuster(options, held, config, list(priors), model)
+    prior_options = pycolmap.PosePriorBundleAdjustmentOptions()
+    prior_options.alignment_ransac.random_seed = 0
+    return pycolmap.create_pose_prior_ceres_bundle_adjuster(
+        options, prior_options, config, list(priors), model
+    )

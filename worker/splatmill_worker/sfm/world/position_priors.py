@@ -15,9 +15,9 @@ from splatmill_worker.colmap import pycolmap
 from splatmill_worker.scene import Float
 from splatmill_worker.sfm.world import geodesy, georeference
 
-ALIKE = 30
-"""Photos that share an error of GPS, which changes over minutes: so much less each of them counts (decisions:
-position-priors)."""
+PHOTOS_PER_ERROR = 30
+"""Photos that are assumed to share one error of GPS, which changes over minutes. The variance of each prior is
+multiplied by it (decisions: position-priors)."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class PositionPriors:
 
     to_metres: from the world of the model to metres to the east, to the north and upwards.
     priors: of each photo whose position agrees with the others, in those metres.
-    error: standard deviation of a coordinate of one of them, in metres.
+    error: standard deviation of a coordinate of one of them, in metres, at least georeference.GPS_ERROR.
     """
 
     to_metres: pycolmap.Sim3d
@@ -35,21 +35,28 @@ class PositionPriors:
 
 
 def position_priors(model: pycolmap.Reconstruction, places: Mapping[int, Float]) -> PositionPriors | None:
-    """The priors of the registered photos of `model`; None where their positions do not fit its cameras.
+    """The priors of the registered photos of `model`.
 
     places: latitude and longitude in degrees and altitude in metres, float64 [3], of each photo by its image's id; not
         finite where the photo has none.
+
+    None where too few photos have a whole position, where all altitudes are one value, which a program may have
+    written for those that it did not know, where positions do not agree with the cameras, and where they lie along a
+    line: photos beside it could be anywhere around it.
     """
-    known = sorted(image for image in model.reg_image_ids() if np.isfinite(places[image]).all())
-    if not known:
+    images = sorted(model.reg_image_ids())
+    known = [image for image in images if np.isfinite(places[image]).all()]
+    if len(known) < georeference.AGREEING * len(images):
         return None
     measured = np.array([places[image] for image in known])
+    if not np.ptp(measured[:, 2]) > 0.0:
+        return None
     metres = geodesy.local(measured, np.median(measured, axis=0))
     centers = np.array([model.images[image].projection_center() for image in known])
-    found = georeference.fit(centers, metres)
-    if isinstance(found, str):
+    fit = georeference.fit(centers, metres)
+    if isinstance(fit, str) or georeference.down_by(fit) is None:
         return None
-    covariance = ALIKE * found.error**2 * np.eye(3)
+    covariance = PHOTOS_PER_ERROR * fit.error**2 * np.eye(3)
     priors = tuple(
         pycolmap.PosePrior(
             corr_data_id=model.images[image].data_id,
@@ -57,8 +64,8 @@ def position_priors(model: pycolmap.Reconstruction, places: Mapping[int, Float])
             position_covariance=covariance,
             coordinate_system=pycolmap.PosePriorCoordinateSystem.CARTESIAN,
         )
-        for image, place, agrees in zip(known, metres, found.agreeing, strict=True)
+        for image, place, agrees in zip(known, metres, fit.agreeing, strict=True)
         if agrees
     )
-    turn = pycolmap.Rotation3d(found.rotation)
-    return PositionPriors(pycolmap.Sim3d(found.scale, turn, found.translation), priors, found.error)
+    turn = pycolmap.Rotation3d(fit.rotation)
+    return PositionPriors(pycolmap.Sim3d(fit.scale, turn, fit.translation), priors, fit.error)
