@@ -138,9 +138,10 @@ def _second_lens(
     for _ in range(ROUNDS):
         images = {image_id for image_id, photo in photo_of.items() if photo in second}
         trial = registered(model, new_id, images)
-        deviations = Deviations.of(trial, bundle_adjust(trial, threads, cancelled=cancelled))
-        cameras = trial.cameras[old_id], trial.cameras[new_id]
-        focals = [math.log(camera.mean_focal_length()) for camera in cameras]
+        bundle_adjust(trial, threads, cancelled=cancelled)
+        deviations = Deviations(trial)
+        cameras = old_id, new_id
+        focals = [math.log(trial.cameras[camera].mean_focal_length()) for camera in cameras]
         uncertainty = math.hypot(*(deviations.focal(camera) for camera in cameras))
         differ = abs(focals[1] - focals[0]) >= max(LEAST_DIFFERENCE, LEAST_DEVIATIONS * uncertainty)
         if not differ or not deviations.error <= (1 - LEAST_GAIN) * single:

@@ -7,6 +7,7 @@ focal length. Does not prove that photos of such motions can be matched.
 import numpy as np
 import pytest
 
+from splatmill_worker.colmap import pycolmap
 from splatmill_worker.errors import Cancelled
 from splatmill_worker.sfm.mapping import adjust
 from splatmill_worker.sfm.mapping.adjust import adjust_with_lenses
@@ -86,3 +87,49 @@ def test_a_model_that_has_lost_all_points_is_adjusted_to_nothing() -> None:
     adjusted = adjust_with_lenses(model, {1: FOCAL}, 1, lambda: False)
     assert adjusted.assumed == {1}
     assert adjusted.model.cameras[1].focal_length == pytest.approx(FOCAL)
+
+
+@pytest.mark.parametrize(
+    "motion", [ball, circle(0.0), line, grid], ids=["ball", "level circle", "line", "grid"]
+)
+def test_a_part_of_many_photos_determines_no_more_than_all(
+    motion: Motion, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = model_of(motion, FOCAL, few=12)
+    adjust.bundle_adjust(model, 1, cancelled=lambda: False)
+    whole = adjust.Deviations(model)
+    monkeypatch.setattr(adjust, "PART", 24)
+    part = adjust.part_of(model, 24)
+    part.update_point_3d_errors()
+    assert sorted(part.reg_image_ids()) == [*range(1, 13), *range(13, 25)]
+    assert part.compute_num_observations() < model.compute_num_observations()
+    split = adjust.Deviations(model)
+    for camera in (1, 2):
+        assert split.focal(camera) == pytest.approx(whole.focal(camera), rel=1e-6)
+        assert adjust.Deviations(part).focal(camera) >= 0.9 * whole.focal(camera)
+        assert split.focal_is_determined(camera) == whole.focal_is_determined(camera)
+
+
+def test_a_part_that_determines_a_lens_is_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = model_of(ball, FOCAL)
+    monkeypatch.setattr(adjust, "PART", 18)
+    estimated: list[int] = []
+    estimate = adjust.Estimate.of
+
+    def count(each: pycolmap.Reconstruction) -> adjust.Estimate:
+        estimated.append(each.num_reg_images())
+        return estimate(each)
+
+    monkeypatch.setattr(adjust.Estimate, "of", count)
+    adjusted = adjust_with_lenses(model, {1: FOCAL}, 1, lambda: False)
+    assert adjusted.model.cameras[1].model.name == "OPENCV"
+    assert estimated == [18]
+
+
+def test_the_trust_region_goes_on_where_an_earlier_call_has_left_it() -> None:
+    assert (
+        adjust.trust_region_radius(0)
+        == pycolmap.BundleAdjustmentOptions().ceres.solver_options.initial_trust_region_radius
+    )
+    assert adjust.trust_region_radius(3) == 27 * adjust.trust_region_radius(0)
+    assert adjust.trust_region_radius(1000) == adjust.LARGEST_RADIUS

@@ -19,7 +19,7 @@ from splatmill_worker.images.exif import Exif
 from splatmill_worker.sfm import final_model
 from splatmill_worker.sfm.cameras import CameraGroup
 from splatmill_worker.sfm.mapping import adjust
-from splatmill_worker.sfm.mapping.adjust import Deviations, adjust_with_lenses, bundle_adjust
+from splatmill_worker.sfm.mapping.adjust import adjust_with_lenses
 from splatmill_worker.sfm.options import SfmOptions
 from splatmill_worker.sfm.world import geodesy
 from splatmill_worker.sfm.world.georeference import umeyama
@@ -170,12 +170,13 @@ def test_the_same_photos_give_the_same_cameras(flown: Flown) -> None:
     np.testing.assert_allclose(centers_of(first), centers_of(second), atol=1e-9)
 
 
-def test_many_calls_of_the_solver_end_where_one_does(flown: Flown, monkeypatch: pytest.MonkeyPatch) -> None:
-    model, truth, without = flown
+def test_many_calls_of_the_solver_end_where_one_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    """To a centimetre; with a trust region that begins anew with each call, to four."""
+    model, truth = flight(2e-5)
     whole, _ = adjusted(model, truth + MEASURED)
     monkeypatch.setattr(adjust, "ITERATED_OBSERVATIONS", 1)
     parts, _ = adjusted(model, truth + MEASURED)
-    assert np.abs(centers_of(whole) - centers_of(parts)).max() < 0.1 * without / UNIT
+    assert np.abs(centers_of(whole) - centers_of(parts)).max() * UNIT < 0.01
 
 
 def test_photos_without_a_pose_or_an_altitude_and_with_a_wrong_position_take_no_part(flown: Flown) -> None:
@@ -224,19 +225,3 @@ def test_intrinsics_that_are_fixed_stay(flown: Flown) -> None:
     result, _ = adjusted(model, truth + MEASURED, fixed=True)
     np.testing.assert_array_equal(result.cameras[1].params, model.cameras[1].params)
     assert error(result, truth) < 3.0
-
-
-def test_whether_photos_determine_their_lens_is_judged_without_gps(flown: Flown) -> None:
-    model, truth, _ = flown
-    places = {number + 1: geodesy.place(place, LUND) for number, place in enumerate(truth)}
-    gps = position_priors(model, places)
-    assert gps is not None
-    moved = copy.deepcopy(model)
-    moved.transform(gps.to_metres)
-    observations = moved.compute_num_observations()
-    solved = bundle_adjust(moved, 1, priors=gps.priors, cancelled=lambda: False)
-    with_gps = Deviations.of(moved, solved)
-    alone = copy.deepcopy(model)
-    without_gps = Deviations.of(alone, bundle_adjust(alone, 1, cancelled=lambda: False))
-    assert with_gps.focal(moved.cameras[1]) == pytest.approx(without_gps.focal(alone.cameras[1]), rel=0.05)
-    assert solved.solve().num_residuals == 2 * observations

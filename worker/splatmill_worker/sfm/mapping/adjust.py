@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -30,15 +30,20 @@ FOCAL_DEVIATION = 0.05
 """Relative standard deviation up to which an estimated focal length is used. Beyond it noise biases the estimate too:
 along a line it falls to half of the true one (decisions: FOCAL_DEVIATION)."""
 
+PART = 250
+"""Photos of which the covariance is estimated first: 250 take a second, 1,000 half a minute."""
+
 MAX_ITERATIONS = 50
 """Iterations of the last bundle adjustment, at most."""
 
 ITERATED_OBSERVATIONS = 2_000_000
-"""Observations times iterations of one call of the solver: about four seconds of one core. The next call begins with a
-new trust region, so that fewer would take more iterations."""
+"""Observations times iterations of one call of the solver: about four seconds of one core."""
 
 LEAST_ITERATIONS = 3
 """Iterations of one call of the solver, at least."""
+
+FIRST_RADIUS, LARGEST_RADIUS = 1e4, 1e16
+"""Radius of the solver's trust region at first, and at most; Ceres's."""
 
 FUNCTION_TOLERANCE = 1e-6
 """Relative decrease of the cost below which the last bundle adjustment has converged."""
@@ -87,16 +92,18 @@ def adjust_with_lenses(
     while rich:
         trial = copy.deepcopy(model)
         _use_opencv(trial, rich)
-        deviations = Deviations.of(trial, adjust(trial))
-        loose = {camera for camera in rich if not deviations.stretch_is_determined(trial.cameras[camera])}
+        adjust(trial)
+        deviations = Deviations(trial)
+        loose = {camera for camera in rich if not deviations.stretch_is_determined(camera)}
         if not loose:
             if implausible_intrinsics(trial) is None:
                 return Adjusted(trial, frozenset(tied))
             break
         tied |= loose
         rich -= loose
-    deviations = Deviations.of(model, adjust(model))
-    assumed = {camera for camera in initial if not deviations.focal(model.cameras[camera]) <= FOCAL_DEVIATION}
+    adjust(model)
+    deviations = Deviations(model)
+    assumed = {camera for camera in initial if not deviations.focal_is_determined(camera)}
     if assumed:
         for camera in assumed:
             params = np.array(model.cameras[camera].params)
@@ -113,6 +120,15 @@ def iterations_at_once(model: pycolmap.Reconstruction, most: int) -> int:
     """
     observations = max(1, model.compute_num_observations())
     return min(most, max(LEAST_ITERATIONS, ITERATED_OBSERVATIONS // observations))
+
+
+def trust_region_radius(done: int) -> float:
+    """Radius of the trust region with which a call of the solver goes on after so many iterations of earlier calls.
+
+    A good iteration triples it. Begun anew with each call, it would keep what observations hardly determine, such as
+    the bulge of a wide scene, from moving at all.
+    """
+    return min(FIRST_RADIUS * 3.0 ** min(done, 100), LARGEST_RADIUS)
 
 
 def median_error(model: pycolmap.Reconstruction) -> float:
@@ -154,42 +170,91 @@ def _use_opencv(model: pycolmap.Reconstruction, cameras: Collection[int]) -> Non
         camera.params = [focal, focal, cx, cy, k1, 0.0, 0.0, 0.0]
 
 
-@dataclass(frozen=True)
 class Deviations:
-    """Standard deviations of the lens parameters in a bundle adjustment.
+    """Standard deviations of the lens parameters at the solution of a bundle adjustment of all that it may change.
 
-    covariance: of residuals of one pixel; None where it is singular.
+    Time and memory grow with the third and second power of the number of photos. So a part of many photos is asked
+    first whether it determines a parameter: what it does, all of them do.
+
     error: median over the points of the mean reprojection error, in pixels; infinite without points.
     """
 
-    covariance: pycolmap.BACovariance | None
-    error: float
+    def __init__(self, model: pycolmap.Reconstruction) -> None:
+        self._model, self.error = model, median_error(model)
 
-    @staticmethod
-    def of(model: pycolmap.Reconstruction, adjuster: pycolmap.CeresBundleAdjuster) -> Deviations:
-        """The standard deviations at the solution that `adjuster` has found for `model`."""
-        covariance = pycolmap.estimate_ba_covariance(pycolmap.BACovarianceOptions(), model, adjuster)
-        return Deviations(covariance, median_error(model))
-
-    def stretch_is_determined(self, camera: pycolmap.Camera) -> bool:
+    def stretch_is_determined(self, camera_id: int) -> bool:
         """Whether the ratio fx / fy of an OPENCV camera is known to STRETCH_PIXELS."""
-        both = self._of(camera)
-        if both is None:
-            return False
-        gradient = np.array([1.0, -1.0]) / camera.params[:2]
-        deviation = self.error * math.sqrt(gradient @ both[:2, :2] @ gradient)
-        return deviation * max(camera.width, camera.height) / 2 <= STRETCH_PIXELS
+        return any(self._stretch(each, camera_id) <= STRETCH_PIXELS for each in self._estimates())
 
-    def focal(self, camera: pycolmap.Camera) -> float:
+    def focal_is_determined(self, camera_id: int) -> bool:
+        """Whether the focal length of a camera is known to FOCAL_DEVIATION."""
+        return any(self._focal(each, camera_id) <= FOCAL_DEVIATION for each in self._estimates())
+
+    def focal(self, camera_id: int) -> float:
         """The relative standard deviation of the focal length, a camera's first parameter; infinite if it is free."""
-        covariance = self._of(camera)
+        return self._focal(self._whole, camera_id)
+
+    def _estimates(self) -> Iterator[Estimate]:
+        if self._model.num_reg_images() > PART:
+            yield self._part
+        yield self._whole
+
+    @cached_property
+    def _whole(self) -> Estimate:
+        return Estimate.of(self._model)
+
+    @cached_property
+    def _part(self) -> Estimate:
+        return Estimate.of(part_of(self._model, PART))
+
+    def _stretch(self, estimate: Estimate, camera_id: int) -> float:
+        """Standard deviation of fx / fy, as a displacement of the longer edge of the photo in pixels."""
+        covariance = estimate.covariance_of(camera_id)
         if covariance is None:
             return math.inf
-        return float(self.error * math.sqrt(covariance[0, 0]) / camera.params[0])
+        camera = self._model.cameras[camera_id]
+        gradient = np.array([1.0, -1.0]) / camera.params[:2]
+        deviation = self.error * math.sqrt(gradient @ covariance[:2, :2] @ gradient)
+        return deviation * max(camera.width, camera.height) / 2
 
-    def _of(self, camera: pycolmap.Camera) -> np.ndarray | None:
+    def _focal(self, estimate: Estimate, camera_id: int) -> float:
+        covariance = estimate.covariance_of(camera_id)
+        if covariance is None:
+            return math.inf
+        return float(self.error * math.sqrt(covariance[0, 0]) / self._model.cameras[camera_id].params[0])
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """The covariance of a model's parameters, of residuals of one pixel; None where it is singular."""
+
+    model: pycolmap.Reconstruction
+    covariance: pycolmap.BACovariance | None
+
+    @classmethod
+    def of(cls, model: pycolmap.Reconstruction) -> Estimate:
+        problem = _problem(model, _options(1))
+        return cls(model, pycolmap.estimate_ba_covariance(pycolmap.BACovarianceOptions(), model, problem))
+
+    def covariance_of(self, camera_id: int) -> np.ndarray | None:
+        """That of a camera's parameters; None where the model does not have it."""
+        if self.covariance is None or camera_id not in self.model.cameras:
+            return None
         # COLMAP finds the parameters of a camera by their address, which the view `params` keeps.
-        return None if self.covariance is None else self.covariance.get_other_params_cov(camera.params)
+        return self.covariance.get_other_params_cov(self.model.cameras[camera_id].params)
+
+
+def part_of(model: pycolmap.Reconstruction, most: int) -> pycolmap.Reconstruction:
+    """A copy with about `most` of the registered photos: of each camera the same number, in order of their ids."""
+    of_camera: dict[int, list[int]] = {}
+    for image_id in sorted(model.reg_image_ids()):
+        of_camera.setdefault(model.images[image_id].camera_id, []).append(image_id)
+    kept = {image for images in of_camera.values() for image in images[: max(1, most // len(of_camera))]}
+    part = copy.deepcopy(model)
+    for image_id in model.reg_image_ids():
+        if image_id not in kept:
+            part.deregister_frame(part.images[image_id].frame_id)
+    return registered(part)
 
 
 def bundle_adjust(
@@ -201,7 +266,7 @@ def bundle_adjust(
     priors: Sequence[pycolmap.PosePrior] = (),
     cancelled: Callable[[], bool],
     on_iterations: Callable[[int], None] = lambda done: None,
-) -> pycolmap.CeresBundleAdjuster:
+) -> None:
     """Adjust all poses, points and (unless fixed) lenses to convergence, with a robust loss, in place.
 
     fixed_intrinsics: keep focal lengths and distortion.
@@ -209,56 +274,75 @@ def bundle_adjust(
     priors: positions of photos that are observations too, in the world of `model`.
     on_iterations: called with the number of iterations so far, every few seconds in a large model.
 
-    Returns the solved problem, without the priors. Raises Cancelled between iterations, as often, when the caller has
-    asked to stop.
+    Raises Cancelled between iterations, as often, when the caller has asked to stop.
     """
-    options = pycolmap.BundleAdjustmentOptions()
-    options.refine_principal_point = False
+    options = _options(threads)
     options.refine_extra_params = not fixed_intrinsics
     options.refine_focal_length = not fixed_intrinsics and not fixed_focal
+    at_once = iterations_at_once(model, MAX_ITERATIONS)
+    options.ceres.solver_options.max_num_iterations = at_once
+    for done in range(0, MAX_ITERATIONS, at_once):
+        on_iterations(done)
+        stop_if(cancelled)
+        options.ceres.solver_options.initial_trust_region_radius = trust_region_radius(done)
+        problem = _problem_with(priors, model, options) if priors else _problem(model, options)
+        solved = problem.solve()
+        del problem  # before the next one is built
+        if _has_converged(solved):
+            break
+    model.update_point_3d_errors()
+    stop_if(cancelled)
+
+
+def _has_converged(solved: pycolmap.BundleAdjustmentSummary) -> bool:
+    """Whether a call of the solver has ended by itself, or brought less than one iteration has to."""
+    if solved.termination_type != pycolmap.BundleAdjustmentTerminationType.NO_CONVERGENCE:
+        return True
+    assert isinstance(solved, pycolmap.CeresBundleAdjustmentSummary)
+    costs = solved.ceres_summary
+    return bool(costs.initial_cost - costs.final_cost <= FUNCTION_TOLERANCE * costs.initial_cost)
+
+
+def _options(threads: int) -> pycolmap.BundleAdjustmentOptions:
+    """Those of an adjustment of poses, points and lenses."""
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_principal_point = False
     options.ceres.use_gpu = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
     options.ceres.solver_options.num_threads = threads
     options.ceres.solver_options.function_tolerance = FUNCTION_TOLERANCE
     options.ceres.min_num_residuals_for_cpu_multi_threading = 5000
+    return options
+
+
+def _all_photos(model: pycolmap.Reconstruction) -> pycolmap.BundleAdjustmentConfig:
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in model.reg_image_ids():
         config.add_image(image_id)
+    return config
+
+
+def _problem(
+    model: pycolmap.Reconstruction, options: pycolmap.BundleAdjustmentOptions
+) -> pycolmap.CeresBundleAdjuster:
+    """The problem of an adjustment of all photos."""
+    config = _all_photos(model)
     # Fixes the seven degrees of gauge freedom, as `pycolmap.bundle_adjustment` does; that function also logs.
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    at_once = iterations_at_once(model, MAX_ITERATIONS)
-    options.ceres.solver_options.max_num_iterations = at_once
-    adjuster = None
-    for done in range(0, MAX_ITERATIONS, at_once):
-        on_iterations(done)
-        stop_if(cancelled)
-        if priors:
-            # COLMAP shifts the model when it builds this problem and back when it has solved it, so only once.
-            adjuster = None  # the last one is freed before the next is built
-            adjuster = _problem_with(priors, options, model)
-        elif adjuster is None:
-            adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
-        if adjuster.solve().termination_type != pycolmap.BundleAdjustmentTerminationType.NO_CONVERGENCE:
-            break
-    model.update_point_3d_errors()
-    stop_if(cancelled)
-    if priors or adjuster is None:
-        adjuster = None
-        adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
-    return adjuster
+    return pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
 
 
 def _problem_with(
     priors: Sequence[pycolmap.PosePrior],
-    options: pycolmap.BundleAdjustmentOptions,
     model: pycolmap.Reconstruction,
+    options: pycolmap.BundleAdjustmentOptions,
 ) -> pycolmap.CeresBundleAdjuster:
-    """The problem of an adjustment of all photos with `priors`, which take the place of a fixed gauge."""
-    config = pycolmap.BundleAdjustmentConfig()
-    for image_id in model.reg_image_ids():
-        config.add_image(image_id)
+    """The problem of an adjustment of all photos with `priors`, which take the place of a fixed gauge.
+
+    COLMAP shifts the model when it builds this problem and back when it has solved it, so it can be solved once.
+    """
     prior_options = pycolmap.PosePriorBundleAdjustmentOptions()
     prior_options.alignment_ransac.random_seed = 0
     return pycolmap.create_pose_prior_ceres_bundle_adjuster(
-        options, prior_options, config, list(priors), model
+        options, prior_options, _all_photos(model), list(priors), model
     )
