@@ -4,6 +4,9 @@ The models are generated: points, cameras, and observations with an error of a t
 focal length. Does not prove that photos of such motions can be matched.
 """
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -124,6 +127,28 @@ def test_a_part_that_determines_a_lens_is_enough(monkeypatch: pytest.MonkeyPatch
     adjusted = adjust_with_lenses(model, {1: FOCAL}, 1, lambda: False)
     assert adjusted.model.cameras[1].model.name == "OPENCV"
     assert estimated == [18]
+
+
+def test_a_part_has_no_points_of_two_photos_and_an_infinite_covariance_is_none() -> None:
+    """Rays that are nearly parallel make the covariance of a whole part infinite, as on a ground of 1,000 photos."""
+    model = model_of(ball, FOCAL)
+    tracks = {
+        number: list(point.track.elements) for number, point in model.points3D.items() if number % 2 == 0
+    }
+    for elements in tracks.values():
+        for element in elements:
+            if 2 < element.image_id <= 18:
+                model.delete_observation(element.image_id, element.point2D_idx)
+    part = adjust.part_of(model, 18)
+    assert part.num_reg_images() == 18
+    assert min(point.track.length() for point in part.points3D.values()) == 3
+    estimate = adjust.Estimate.of(part)
+    assert estimate.covariance_of(1) is not None
+    assert estimate.covariance_of(9) is None
+    infinite: Any = SimpleNamespace(
+        get_other_params_cov=lambda params: np.full((len(params), len(params)), np.inf)
+    )
+    assert adjust.Estimate(part, infinite).covariance_of(1) is None
 
 
 def test_the_trust_region_goes_on_where_an_earlier_call_has_left_it() -> None:
