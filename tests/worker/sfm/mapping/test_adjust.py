@@ -152,9 +152,8 @@ def test_a_part_has_no_points_of_two_photos_and_an_infinite_covariance_is_none()
 
 
 def test_the_trust_region_goes_on_where_an_earlier_call_has_left_it() -> None:
-    assert (
-        adjust.trust_region_radius(0)
-        == pycolmap.BundleAdjustmentOptions().ceres.solver_options.initial_trust_region_radius
-    )
-    assert adjust.trust_region_radius(3) == 27 * adjust.trust_region_radius(0)
-    assert adjust.trust_region_radius(1000) == adjust.LARGEST_RADIUS
+    first = pycolmap.BundleAdjustmentOptions().ceres.solver_options.initial_trust_region_radius
+    assert first == adjust.FIRST_RADIUS
+    assert adjust.radius_after(first, 3, 0) == 27 * first
+    assert adjust.radius_after(first, 0, 3) == first / 64
+    assert adjust.radius_after(first, 50, 0) == adjust.LARGEST_RADIUS

@@ -125,13 +125,14 @@ def iterations_at_once(model: pycolmap.Reconstruction, most: int) -> int:
     return min(most, max(LEAST_ITERATIONS, ITERATED_OBSERVATIONS // observations))
 
 
-def trust_region_radius(done: int) -> float:
-    """Radius of the trust region with which a call of the solver goes on after so many iterations of earlier calls.
+def radius_after(radius: float, good: int, bad: int) -> float:
+    """Radius of the trust region after so many good and bad steps of the solver: a good one triples it at most, and bad
+    ones divide it by 2, 4, 8 and so on.
 
-    A good iteration triples it. Begun anew with each call, it would keep what observations hardly determine, such as
-    the bulge of a wide scene, from moving at all.
+    A call that began anew with the first radius would keep what observations hardly determine, such as the bulge of a
+    wide scene, from moving at all.
     """
-    return min(FIRST_RADIUS * 3.0 ** min(done, 100), LARGEST_RADIUS)
+    return float(min(radius * 3.0**good / 2.0 ** (bad * (bad + 1) / 2), LARGEST_RADIUS))
 
 
 def median_error(model: pycolmap.Reconstruction) -> float:
@@ -292,26 +293,24 @@ def bundle_adjust(
     options.refine_focal_length = not fixed_intrinsics and not fixed_focal
     at_once = iterations_at_once(model, MAX_ITERATIONS)
     options.ceres.solver_options.max_num_iterations = at_once
+    radius = FIRST_RADIUS
     for done in range(0, MAX_ITERATIONS, at_once):
         on_iterations(done)
         stop_if(cancelled)
-        options.ceres.solver_options.initial_trust_region_radius = trust_region_radius(done)
+        options.ceres.solver_options.initial_trust_region_radius = radius
         problem = _problem_with(priors, model, options) if priors else _problem(model, options)
         solved = problem.solve()
         del problem  # before the next one is built
-        if _has_converged(solved):
+        if solved.termination_type != pycolmap.BundleAdjustmentTerminationType.NO_CONVERGENCE:
             break
+        assert isinstance(solved, pycolmap.CeresBundleAdjustmentSummary)
+        steps = solved.ceres_summary
+        good = steps.num_successful_steps - 1  # the first one is where it begins
+        if good and steps.initial_cost - steps.final_cost <= FUNCTION_TOLERANCE * steps.initial_cost:
+            break
+        radius = radius_after(radius, good, steps.num_unsuccessful_steps)
     model.update_point_3d_errors()
     stop_if(cancelled)
-
-
-def _has_converged(solved: pycolmap.BundleAdjustmentSummary) -> bool:
-    """Whether a call of the solver has ended by itself, or brought less than one iteration has to."""
-    if solved.termination_type != pycolmap.BundleAdjustmentTerminationType.NO_CONVERGENCE:
-        return True
-    assert isinstance(solved, pycolmap.CeresBundleAdjustmentSummary)
-    costs = solved.ceres_summary
-    return bool(costs.initial_cost - costs.final_cost <= FUNCTION_TOLERANCE * costs.initial_cost)
 
 
 def _options(threads: int) -> pycolmap.BundleAdjustmentOptions:

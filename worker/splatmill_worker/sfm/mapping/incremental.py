@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.sfm.callbacks import stop_if
-from splatmill_worker.sfm.mapping.adjust import iterations_at_once, trust_region_radius
+from splatmill_worker.sfm.mapping.adjust import iterations_at_once
 
 OnStep = Callable[[pycolmap.Reconstruction, str], None]
 """Called after each step with the model that grows, and with words for the bundle adjustment that follows, if any."""
@@ -177,7 +177,6 @@ class IncrementalMapping:
         error = math.inf
         for done in range(0, most, at_once):
             self._step(model, words if done == 0 else f"{words}, iteration {done + 1}")
-            adjustment.ceres.solver_options.initial_trust_region_radius = trust_region_radius(done)
             self._mapper.adjust_global_bundle(options, adjustment)
             if at_once < most:
                 # COLMAP does not return whether it has converged.
