@@ -12,7 +12,7 @@ With --growth, "report" is the longest time between two reports of progress, and
 process so far; counts are measured in the order in which they are given.
 Pose errors are medians after the best similarity to the reference: for fox COLMAP's model of the full-size photos
 (itself no truth: its principal point was held), for generated photos the true cameras, for lund the GPS places (10 m
-accurate), positions only, which take part in the last adjustment where their altitudes agree. beer has none: in the
+accurate), positions only, which may have taken part in the last adjustment. beer has none: in the
 COLMAP model that came with it, the camera turns by 167 to 174 degrees between neighbouring frames of a video three
 times (decisions: unfold). Held-out PSNR is that of the default pipeline trained for --train seconds on the cameras with
 the points of structure from motion, longest side 480; stereo adds to them where the pipeline would.

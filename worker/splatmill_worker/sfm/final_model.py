@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -110,8 +111,8 @@ def _adjusted(
 ) -> tuple[pycolmap.Reconstruction, tuple[str, ...]]:
     """The model after the last bundle adjustment, in which GPS takes part, and warnings about its lenses.
 
-    `model` itself is used up. Where an adjustment makes the photos agree much better with GPS, another one follows, in
-    which GPS counts for as much more.
+    `model` is changed, and may be left in metres. Where an adjustment makes the photos agree much better with GPS,
+    another one follows, with priors of the smaller error.
     """
     photos = {
         image_id: run.prepared.photos[features.photo_index(model.images[image_id].name)]
@@ -129,22 +130,26 @@ def _adjusted(
         again = position_priors(model, places)
         if again is None or again.error >= BETTER * gps.error:
             break
-        gps = again
-        model.transform(gps.to_metres)
-        to_metres = gps.to_metres * to_metres
+        trial = copy.deepcopy(model)
+        trial.transform(again.to_metres)
         adjust.bundle_adjust(
-            model,
+            trial,
             run.threads,
             fixed_intrinsics=fixed,
-            fixed_focal=bool(warnings),
-            priors=gps.priors,
+            fixed_focal=bool(
+                warnings
+            ),  # as where the first adjustment has assumed the focal length of one camera
+            priors=again.priors,
             cancelled=run.cancelled,
-            on_iterations=_reporter(run, model),
+            on_iterations=_reporter(run, trial),
         )
+        if checks.implausible_intrinsics(trial) is not None:
+            break
+        model, gps, to_metres = trial, again, again.to_metres * to_metres
     model.transform(to_metres.inverse())
     run.notes.append(
-        f"GPS took part in the last adjustment of the cameras, by the positions of {len(gps.priors)} photos with an "
-        f"error of about {gps.error:.1f} m."
+        f"GPS took part in the last adjustment of the cameras: {len(gps.priors)} positions, with an assumed error of "
+        f"{gps.error:.1f} m."
     )
     return model, warnings
 

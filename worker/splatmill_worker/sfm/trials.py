@@ -23,7 +23,8 @@ def registered_counts(mapped: mapper.Mapped | None) -> tuple[int, int]:
 def best_mapping(run: SfmRun, database: Path, verified: Collection[pairs.Pair]) -> mapper.Mapped:
     """The best of up to three mappings: with the incremental mapper, with the global one, and with relaxed settings.
 
-    The global one is the first where it has placed more photos of the run before (decisions: first-mapper).
+    The global one is the first where `mapper` asks for it, and where it registered more photos at an earlier effort
+    (decisions: first-mapper).
 
     No mapper registers photos that the view graph does not connect, so the next one is not tried where the last
     registered ENOUGH_REGISTERED of the photos that are connected.

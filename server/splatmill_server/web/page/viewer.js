@@ -136,7 +136,7 @@ export class View extends EventTarget {
     this.overlay = new Overlay(over);
     this.poster = document.createElement("img");
     this.poster.alt = "";
-    this.poster.decoding = "sync"; // decoded later, it would leave the view empty for a frame after the page's own copy of it
+    this.poster.decoding = "sync"; // otherwise the view is empty for one frame after it replaces the page's own picture
     this.poster.addEventListener("error", () => this.poster.remove());
     /** What of the model is missing, in words. */
     this.warning = "";

@@ -4,6 +4,7 @@ The models are generated: points, cameras, and observations with an error of a t
 focal length. Does not prove that photos of such motions can be matched.
 """
 
+import math
 from types import SimpleNamespace
 from typing import Any
 
@@ -101,16 +102,13 @@ def test_a_part_of_many_photos_determines_no_more_than_all(
     model = model_of(motion, FOCAL, few=12)
     adjust.bundle_adjust(model, 1, cancelled=lambda: False)
     whole = adjust.Deviations(model)
+    answers = [whole.focal_is_determined(camera) for camera in (1, 2)]
     monkeypatch.setattr(adjust, "PART", 24)
-    part = adjust.part_of(model, 24)
-    part.update_point_3d_errors()
-    assert sorted(part.reg_image_ids()) == [*range(1, 13), *range(13, 25)]
-    assert part.compute_num_observations() < model.compute_num_observations()
     split = adjust.Deviations(model)
+    assert sorted(split._part.model.reg_image_ids()) == list(range(1, 25))
+    assert [split.focal_is_determined(camera) for camera in (1, 2)] == answers
     for camera in (1, 2):
-        assert split.focal(camera) == pytest.approx(whole.focal(camera), rel=1e-6)
-        assert adjust.Deviations(part).focal(camera) >= 0.9 * whole.focal(camera)
-        assert split.focal_is_determined(camera) == whole.focal_is_determined(camera)
+        assert whole.focal(camera) <= split._focal(split._part, camera) < math.inf
 
 
 def test_a_part_that_determines_a_lens_is_enough(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -155,5 +153,6 @@ def test_the_trust_region_goes_on_where_an_earlier_call_has_left_it() -> None:
     first = pycolmap.BundleAdjustmentOptions().ceres.solver_options.initial_trust_region_radius
     assert first == adjust.FIRST_RADIUS
     assert adjust.radius_after(first, 3, 0) == 27 * first
-    assert adjust.radius_after(first, 0, 3) == first / 64
+    assert adjust.radius_after(9 * first, 2, 3) == 81 / 8 * first
+    assert adjust.radius_after(first, 8, 40) == first
     assert adjust.radius_after(first, 50, 0) == adjust.LARGEST_RADIUS

@@ -153,7 +153,7 @@ def test_a_bulge_goes(flown: Flown, noise: str) -> None:
     assert result.compute_mean_reprojection_error() < 0.5
     # It is where it was, in its own unit, and not where GPS has it.
     assert np.abs(centers_of(result) - centers_of(model)).max() < 10.0 / UNIT
-    assert [note for note in notes if note.startswith("GPS took part") and "of 144 photos" in note]
+    assert [note for note in notes if note.startswith("GPS took part") and "144 positions" in note]
 
 
 def test_a_bulge_larger_than_the_error_of_gps_goes_too(flown: Flown) -> None:
@@ -190,7 +190,7 @@ def test_photos_without_a_pose_or_an_altitude_and_with_a_wrong_position_take_no_
     result, notes = adjusted(some, measured, heights)
     registered = [image - 1 for image in sorted(result.reg_image_ids())]
     assert len(registered) == len(truth) - 11
-    assert [note for note in notes if "of 110 photos" in note]
+    assert [note for note in notes if "110 positions" in note]
     assert error(result, truth[registered]) < 0.5 * without
 
 

@@ -34,7 +34,7 @@ PART = 250
 """Photos of which the covariance is estimated first: that of 250 takes 2 s, that of 1,000 takes 37 s."""
 
 LEAST_TRACK = 3
-"""Observations of a point in a part of the photos, at least."""
+"""Observations of a point in a part of the photos, at least; see `part_of`."""
 
 MAX_ITERATIONS = 50
 """Iterations of the last bundle adjustment, at most."""
@@ -98,6 +98,7 @@ def adjust_with_lenses(
         adjust(trial)
         deviations = Deviations(trial)
         loose = {camera for camera in rich if not deviations.stretch_is_determined(camera)}
+        del deviations
         if not loose:
             if implausible_intrinsics(trial) is None:
                 return Adjusted(trial, frozenset(tied))
@@ -107,6 +108,7 @@ def adjust_with_lenses(
     adjust(model)
     deviations = Deviations(model)
     assumed = {camera for camera in initial if not deviations.focal_is_determined(camera)}
+    del deviations
     if assumed:
         for camera in assumed:
             params = np.array(model.cameras[camera].params)
@@ -126,13 +128,13 @@ def iterations_at_once(model: pycolmap.Reconstruction, most: int) -> int:
 
 
 def radius_after(radius: float, good: int, bad: int) -> float:
-    """Radius of the trust region after so many good and bad steps of the solver: a good one triples it at most, and bad
-    ones divide it by 2, 4, 8 and so on.
+    """An estimate of the radius of the trust region after so many good and bad steps of the solver.
 
-    A call that began anew with the first radius would keep what observations hardly determine, such as the bulge of a
-    wide scene, from moving at all.
+    A good step triples it at most, and the first bad one after it halves it. It is not taken for less than the first
+    radius. A call that began anew with that one would keep what observations hardly determine, such as the bulge of a
+    wide scene, from moving at all; one that begins with too large a radius makes a few bad steps.
     """
-    return float(min(radius * 3.0**good / 2.0 ** (bad * (bad + 1) / 2), LARGEST_RADIUS))
+    return float(np.clip(radius * 3.0**good / 2.0**bad, FIRST_RADIUS, LARGEST_RADIUS))
 
 
 def median_error(model: pycolmap.Reconstruction) -> float:
@@ -177,8 +179,9 @@ def _use_opencv(model: pycolmap.Reconstruction, cameras: Collection[int]) -> Non
 class Deviations:
     """Standard deviations of the lens parameters at the solution of a bundle adjustment of all that it may change.
 
-    Time and memory grow with the third and second power of the number of photos. So a part of many photos is asked
-    first whether it determines a parameter: what it does, all of them do.
+    The covariance of many photos takes long, and as much memory as the square of their number. So a part of them is
+    asked first whether it determines a parameter. What it does, all of them do: they have more observations at the
+    same solution. Where it does not, all are asked, without a report of progress.
 
     error: median over the points of the mean reprojection error, in pixels; infinite without points.
     """
@@ -199,7 +202,8 @@ class Deviations:
         return self._focal(self._whole, camera_id)
 
     def _estimates(self) -> Iterator[Estimate]:
-        if self._model.num_reg_images() > PART:
+        # A part has a photo of each camera, so that of many cameras it is hardly smaller.
+        if self._model.num_reg_images() > PART >= 2 * len(self._model.cameras):
             yield self._part
         yield self._whole
 
@@ -252,7 +256,8 @@ class Estimate:
 def part_of(model: pycolmap.Reconstruction, most: int) -> pycolmap.Reconstruction:
     """A copy with about `most` of the registered photos: of each camera the same number, in order of their ids.
 
-    Points that two of them observe are left out: rays that are nearly parallel make a covariance infinite.
+    Points that only two of these observe are left out: where their rays are nearly parallel, they make the covariance
+    infinite.
     """
     of_camera: dict[int, list[int]] = {}
     for image_id in sorted(model.reg_image_ids()):
