@@ -220,6 +220,13 @@ def test_positions_along_a_line_take_no_part(flown: Flown) -> None:
     assert position_priors(model, places) is not None
 
 
+def test_a_model_that_has_lost_all_photos_has_none(flown: Flown) -> None:
+    model = copy.deepcopy(flown[0])
+    for image in list(model.reg_image_ids()):
+        model.deregister_frame(model.images[image].frame_id)
+    assert position_priors(model, {}) is None
+
+
 def test_intrinsics_that_are_fixed_stay(flown: Flown) -> None:
     model, truth, _ = flown
     result, _ = adjusted(model, truth + MEASURED, fixed=True)

@@ -46,7 +46,7 @@ def position_priors(model: pycolmap.Reconstruction, places: Mapping[int, Float])
     """
     images = sorted(model.reg_image_ids())
     known = [image for image in images if np.isfinite(places[image]).all()]
-    if len(known) < georeference.AGREEING * len(images):
+    if not known or len(known) < georeference.AGREEING * len(images):
         return None
     measured = np.array([places[image] for image in known])
     if not np.ptp(measured[:, 2]) > 0.0:
