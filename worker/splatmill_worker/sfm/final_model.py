@@ -126,6 +126,7 @@ def _adjusted(
     to_metres = gps.to_metres
     model.transform(to_metres)
     model, warnings = _solved(run, model, fixed, gps.priors)
+    assumed = bool(warnings)  # the focal length of a camera, which is kept
     for _ in range(MORE_WITH_GPS):
         again = position_priors(model, places)
         if again is None or again.error >= BETTER * gps.error:
@@ -136,9 +137,7 @@ def _adjusted(
             trial,
             run.threads,
             fixed_intrinsics=fixed,
-            fixed_focal=bool(
-                warnings
-            ),  # as where the first adjustment has assumed the focal length of one camera
+            fixed_focal=assumed,
             priors=again.priors,
             cancelled=run.cancelled,
             on_iterations=_reporter(run, trial),
