@@ -188,10 +188,10 @@ def test_a_whole_job_is_watched_from_its_beginning_to_its_model(
     )
     snapshots(page, 1)
 
-    expect(page.locator("#state")).to_have_text("Finished")
+    # It is made before the page of the model asks for it.
+    with page.expect_request(f"**/{job_id}/download/sog", timeout=120_000):
+        expect(page.locator("#state")).to_have_text("Finished")
     assert page.evaluate("notified") == ["watched: Finished."]
-    of_small_file = [line.split()[0] for line in asked if line.endswith(f"{job_id}/download/sog")]
-    assert of_small_file == ["HEAD"], "it is made before the model's page asks for it"
     expect(page.locator("#left")).to_be_empty()
     link = page.get_by_role("link", name="Open the model")
     expect(link).to_have_attribute("href", f"/models/{job_id}")
@@ -212,6 +212,7 @@ def test_a_whole_job_is_watched_from_its_beginning_to_its_model(
     expect(photos).to_contain_text("2 held out")
     expect(photos.get_by_role("row").filter(has_text="stray.png")).to_contain_text("no camera")
     expect(page.locator("#seconds")).to_contain_text("Live view")
+    assert [line.split()[0] for line in asked if line.endswith(f"{job_id}/download/sog")] == ["HEAD"]
     assert {item.get_attribute("data-status") for item in page.locator("#stages > li").all()} == {"done"}
 
     misfit = next(view["name"] for view in report["views"] if view["split"] == "train")

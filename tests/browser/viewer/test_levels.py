@@ -112,8 +112,8 @@ def test_the_first_picture_comes_from_few_bytes_and_the_last_is_that_of_the_whol
 
     # An edit needs to know where each Gaussian is: the whole model takes the place of its parts.
     assert not [line for line in asked if line.endswith("/download/sog")]
-    page.get_by_role("button", name="Crop and clean").click()
-    wait_for(lambda: [line for line in asked if line.endswith("/download/sog")])
+    with page.expect_request("**/download/sog"):
+        page.get_by_role("button", name="Crop and clean").click()
     expect(page.locator(".view .said")).to_be_empty()
     page.get_by_role("button", name="Brush").click()
     page.get_by_role("button", name="Select in the middle").click()
