@@ -177,9 +177,9 @@ class TrainOptions(Request):
         le=4 * 10**12,
         description=(
             "Memory for training: 1.5GB, 2GiB, or a number of bytes. It limits the number of Gaussians, and photos "
-            "that need more than an eighth of it are kept on the disk. What recovering the cameras has left in memory "
-            "counts, but half of it at least is for Gaussians. Left out, half of the machine's free memory, or "
-            "the free memory of the GPU."
+            "that need more than an eighth of it are kept on the disk. The program and what recovering the cameras "
+            "has left in memory count, but half of it at least is for Gaussians. Left out, half of the machine's free "
+            "memory, or the free memory of the GPU."
         ),
         json_schema_extra=_BUDGET | {"kind": "bytes"},
     )

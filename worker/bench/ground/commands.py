@@ -24,6 +24,7 @@ class Usage:
     status: its exit status.
     seconds: of wall time. cpu: seconds of it and of all processes that ended before it.
     memory: largest sum over its processes in bytes; a page that several of them share counts once.
+    memory_after: the line that it had printed last by then.
     others: share of the machine's time that other programs had meanwhile.
     silence: longest time between two lines that it printed, in seconds, and the line before it.
     text: its last lines.
@@ -33,6 +34,7 @@ class Usage:
     seconds: float
     cpu: float
     memory: int
+    memory_after: str
     others: float
     silence: tuple[float, str]
     text: str
@@ -50,19 +52,25 @@ def run(arguments: list[str], log: Path) -> Usage:
             now, line = time.perf_counter(), line.rstrip()
             silence = max(silence, (now - last, tail[-1]))
             last, tail = now, [*tail[-4:], line]
+            memory.line = line
             print(f"{now - start:8.1f}  {line}", file=file, flush=True)
         _, status, use = os.wait4(child.pid, 0)
     child.returncode = os.waitstatus_to_exitcode(status)
     seconds, cpu = time.perf_counter() - start, use.ru_utime + use.ru_stime
     others = max(0.0, worked() - before - cpu) / (seconds * (psutil.cpu_count() or 1))
-    return Usage(child.returncode, seconds, cpu, memory.largest, others, silence, "\n".join(tail))
+    return Usage(
+        child.returncode, seconds, cpu, memory.largest, memory.largest_after, others, silence, "\n".join(tail)
+    )
 
 
 class _Memory:
-    """Watches a process and its descendants, in a thread, while the block runs; `largest`: most memory in bytes."""
+    """Watches a process and its descendants, in a thread, while the block runs.
+
+    line: what it printed last. largest: most memory in bytes. largest_after: `line` at that time.
+    """
 
     def __init__(self, pid: int) -> None:
-        self.largest = 0
+        self.line, self.largest, self.largest_after = "", 0, ""
         self._root, self._ended = psutil.Process(pid), threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
 
@@ -80,4 +88,5 @@ class _Memory:
                 for process in (self._root, *self._root.children(recursive=True)):
                     with suppress(psutil.Error):  # it has ended meanwhile
                         total += process.memory_full_info().pss
-            self.largest = max(self.largest, total)
+            if total > self.largest:
+                self.largest, self.largest_after = total, self.line

@@ -107,8 +107,9 @@ def commanded(row: Row, folder: Path) -> Row:
 def used(usage: Usage) -> Row:
     """The fields of a command's usage."""
     return {
-        "seconds": round(usage.seconds, 1), "cpu": round(usage.cpu, 1), "memory": usage.memory,
-        "others": round(usage.others, 3), "silence": round(usage.silence[0], 1), "silence_after": usage.silence[1],
+        "seconds": round(usage.seconds, 1), "cpu": round(usage.cpu, 1), "others": round(usage.others, 3),
+        "memory": usage.memory, "memory_after": usage.memory_after,
+        "silence": round(usage.silence[0], 1), "silence_after": usage.silence[1],
     }  # fmt: skip
 
 
@@ -159,7 +160,7 @@ def table(rows: list[Row]) -> str:
 
 
 def stages(rows: list[Row]) -> str:
-    """The wall seconds of each stage or unit, and the line before the longest silence."""
+    """The wall seconds of each stage or unit, and the lines before the most memory and before the longest silence."""
     lines = []
     for row in rows:
         parts = dict(row.get("stages", {}))
@@ -167,8 +168,14 @@ def stages(rows: list[Row]) -> str:
         if tiles:
             parts[f"{len(tiles)} tiles"] = round(sum(tiles), 1)
         text = ", ".join(f"{name} {seconds:.0f}" for name, seconds in parts.items() if seconds >= 0.5)
-        lines.append([row["photos"], row["way"], text, f"`{row['silence_after'][:70]}`"])
-    return _page.table("photos:|way|wall seconds of its stages|line before the longest silence", lines)
+        memory, silence = (
+            f"`{row[name][:70]}`" if row.get(name) else "" for name in ("memory_after", "silence_after")
+        )
+        lines.append([row["photos"], row["way"], text, memory, silence])
+    return _page.table(
+        "photos:|way|wall seconds of its stages|line before the most memory|line before the longest silence",
+        lines,
+    )
 
 
 def exponent(rows: list[Row], name: str) -> float | None:

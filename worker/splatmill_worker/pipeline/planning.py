@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from splatmill.schema import Switch
-from splatmill_worker import memory
 from splatmill_worker.errors import Refusal
 from splatmill_worker.kernels.gpu.device import describe
 from splatmill_worker.pipeline.cameras import Cameras
@@ -101,7 +100,6 @@ def _measure_facts(job: Job, cameras: Cameras, photos: Photos, first: First) -> 
     pixels = photos.training[0].full.rgb[..., 0].numel()
     most = resolved(pixels, len(photos.training)) if first.model is None else 0
     speed = probe(open_engine(first.gaussians, job.kernels), photos.training, most=most)
-    memory.return_freed()
     facts = measure(cameras.world, photos.training, len(photos.held_out), speed)
     facts = replace(facts, start=first.model, photo_bytes=photos.size, photos_on_disk=photos.on_disk)
     if isinstance(first.hull, Hull):

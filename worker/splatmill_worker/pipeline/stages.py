@@ -78,7 +78,9 @@ def run(
         photos = planned_photos(job, cameras, planned, stages)
         plan = planned.plan
         first = seeded(planned.first, cameras, photos, plan)
-        engine = open_engine(first, plan.kernels, clustered=plan.cluster_culling)
+        engine = open_engine(
+            first, plan.kernels, clustered=plan.cluster_culling, most_kept=plan.photo_statistics or 0
+        )
         trained, record = train_scene(job, cameras, photos, plan, engine)
     except Cancelled:
         return Outcome("cancelled", workdir / "out")

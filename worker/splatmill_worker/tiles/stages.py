@@ -142,7 +142,10 @@ def _coarse(context: Context, stages: Stages) -> dict[str, Any]:
     context.emit(PlanEvent(plan=decided.as_dict()))
     photos = planned_photos(job, cameras, planned, stages)
     engine = open_engine(
-        seeded(planned.first, cameras, photos, decided), decided.kernels, clustered=decided.cluster_culling
+        seeded(planned.first, cameras, photos, decided),
+        decided.kernels,
+        clustered=decided.cluster_culling,
+        most_kept=decided.photo_statistics or 0,
     )
     # LPIPS is measured of the whole scene.
     trained, _ = train_scene(job, cameras, photos, replace(decided, lpips=False), engine)

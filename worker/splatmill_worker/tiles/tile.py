@@ -87,7 +87,11 @@ def train_tile(tile: Tile, stages: Stages) -> TileResult:
         return TileResult(within, {"gaussians": within.count, "steps": 0, "photos": len(views)})
     plan = tile_plan(coarse, int(free.sum()), len(views))
     engine = open_engine(
-        whole.select(free), plan.kernels, clustered=plan.cluster_culling, context=whole.select(~free)
+        whole.select(free),
+        plan.kernels,
+        clustered=plan.cluster_culling,
+        context=whole.select(~free),
+        most_kept=plan.photo_statistics or 0,
     )
 
     def progress(progress: TrainingProgress) -> None:

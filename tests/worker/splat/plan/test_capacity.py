@@ -122,11 +122,30 @@ def test_memory_bounds_the_gaussians() -> None:
     assert plan.max_gaussians == Plan.gaussians_within(400_000_000) < planned(steps=30_000).max_gaussians
     assert "Memory" in plan.reasons["max_gaussians"]
     assert Plan.gaussians_within(0) == 1000
-    # What recovering the cameras of many photos leaves behind is no room for Gaussians, but half of it all is.
-    for used, left in ((0, 3000 - 350), (1010, 3000 - 1100), (2900, 1500)):
-        after = planned(changed(memory_used=used * 10**6, views=900), max_memory=3 * 10**9, steps=30_000)
+    # What recovering the cameras of many photos leaves behind is no room for Gaussians, nor what training keeps of
+    # the photos, but half of it all is.
+    for used, on_disk, left in (
+        (0, True, 3000 - 350),
+        (0, False, 3000 - 400),
+        (1010, True, 3000 - 1100),
+        (1010, False, 3000 - 1500),
+        (2900, True, 1500),
+    ):
+        large = changed(memory_used=used * 10**6, views=900, photos_on_disk=on_disk)
+        after = planned(large, max_memory=3 * 10**9, steps=30_000)
         assert after.max_gaussians == left * 10**6 // BYTES_PER_GAUSSIAN
         assert ("that the process has" in after.reasons["max_gaussians"]) == (used > 0)
+
+
+def test_what_the_loss_needs_of_photos_alone_is_kept_where_memory_holds_the_photos() -> None:
+    few = planned()
+    assert few.photo_statistics == 28 * 43 * 270 * 480
+    assert "156.0 MB" in few.reasons["photo_statistics"]
+    many = planned(changed(views=900))
+    assert many.photo_statistics == 400 * 10**6
+    in_files = planned(changed(views=900, photos_on_disk=True))
+    assert in_files.photo_statistics is None
+    assert "lie in files" in in_files.left_out["photo_statistics"]
 
 
 def test_more_gaussians_asked_for_never_cut_those_at_the_start() -> None:

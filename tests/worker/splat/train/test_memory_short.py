@@ -12,6 +12,8 @@ import pytest
 import torch
 
 from splatmill_worker.errors import FailureName, TrainingFailed
+from splatmill_worker.splat.engine.cpu import CpuEngine
+from splatmill_worker.splat.engine.open import gaussians_of
 from splatmill_worker.splat.engine.protocol import Engine
 from splatmill_worker.splat.train.loop import Hooks, train
 from tests.support import still_life
@@ -54,3 +56,13 @@ def test_memory_that_never_suffices_is_a_named_failure() -> None:
     with pytest.raises(TrainingFailed) as raised:
         train(cramped, views[1:], views[:1], plan(200), extent=1.1)
     assert raised.value.name is FailureName.memory
+
+
+def test_what_is_not_kept_of_photos_is_computed_anew() -> None:
+    views = still_life.training_views()
+    kept, computed = (
+        train(CpuEngine(gaussians_of(first_engine()), most_kept=most), views[1:], [], plan(60), extent=1.1)
+        for most in (10**9, 0)
+    )
+    for one, other in zip(kept.gaussians, computed.gaussians, strict=True):
+        assert torch.equal(one, other)

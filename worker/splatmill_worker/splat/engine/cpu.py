@@ -6,21 +6,22 @@ from collections.abc import Hashable
 
 from torch import Tensor
 
-from splatmill_worker.kernels.cpu.loss import PhotoStats, photo_stats
+from splatmill_worker.kernels.cpu.loss import BYTES_PER_PIXEL, PhotoStats, photo_stats
 from splatmill_worker.kernels.cpu.step import Step
 from splatmill_worker.kernels.records import Rates
 from splatmill_worker.splat.engine.protocol import StepResult
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.views import over
 
-KEPT_BYTES = 400 * 10**6
-"""Memory for the photos' statistics, bytes, at 28 a pixel. Those of further photos are computed at every visit."""
+MOST_KEPT = 400 * 10**6
+"""Memory for the photos' statistics, bytes, where nothing else is said."""
 
 
 class CpuEngine(Step):
     """An Engine on the C++ kernels, with as many threads as the kernels choose where `threads` is None.
 
     clustered, context: as in `Step`.
+    most_kept: memory for the photos' statistics, bytes. Those of further photos are computed at every visit.
     """
 
     def __init__(
@@ -30,6 +31,7 @@ class CpuEngine(Step):
         threads: int | None = None,
         clustered: bool = False,
         context: Gaussians | None = None,
+        most_kept: int = MOST_KEPT,
     ) -> None:
         super().__init__(
             **gaussians.padded(3).parameters(),
@@ -39,7 +41,7 @@ class CpuEngine(Step):
         )
         self.keep_pose_gradient = False
         self._kept: dict[Hashable, PhotoStats] = {}
-        self._kept_bytes = 0
+        self._kept_bytes, self._most_kept = 0, most_kept
 
     def backward_update(
         self,
@@ -86,12 +88,12 @@ class CpuEngine(Step):
         return StepResult(seen.loss, seen.visible)
 
     def _stats(self, photo: Tensor, mask: Tensor | None, key: Hashable | None) -> PhotoStats:
-        """The part of the loss that depends on the photo alone, kept under `key` while KEPT_BYTES has room."""
+        """The part of the loss that depends on the photo alone, kept under `key` while there is room."""
         if key is not None and key in self._kept:
             return self._kept[key]
         stats = photo_stats(photo, mask=mask)
-        size = 28 * stats.used.numel()
-        if key is not None and self._kept_bytes + size <= KEPT_BYTES:
+        size = BYTES_PER_PIXEL * stats.used.numel()
+        if key is not None and self._kept_bytes + size <= self._most_kept:
             self._kept[key] = stats
             self._kept_bytes += size
         return stats

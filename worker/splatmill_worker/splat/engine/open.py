@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from splatmill_worker.kernels import ops
 from splatmill_worker.splat.engine.autograd import AutogradEngine
-from splatmill_worker.splat.engine.cpu import CpuEngine
+from splatmill_worker.splat.engine.cpu import MOST_KEPT, CpuEngine
 from splatmill_worker.splat.engine.protocol import Engine
 from splatmill_worker.splat.gaussians import Gaussians
 
@@ -15,18 +15,20 @@ def open_engine(
     *,
     clustered: bool = False,
     context: Gaussians | None = None,
+    most_kept: int = MOST_KEPT,
 ) -> Engine:
     """The engine of a backend, holding `gaussians`: the fused step on cpu and gpu, autograd on reference.
 
     clustered: steps leave out clusters of Gaussians that are not in view; for cpu alone.
     context: Gaussians that are rendered with the others, and that nothing moves; not for gpu.
+    most_kept: memory of the cpu engine for what the loss needs of each photo alone, bytes.
 
     Raises ValueError for what the backend does not do.
     """
     if clustered and kernels != "cpu":
         raise ValueError(f"clustered: the {kernels} engine computes all Gaussians at every step")
     if kernels == "cpu":
-        return CpuEngine(gaussians, clustered=clustered, context=context)
+        return CpuEngine(gaussians, clustered=clustered, context=context, most_kept=most_kept)
     if kernels == "gpu":
         if context is not None:
             raise ValueError("context: the gpu engine moves all Gaussians")

@@ -14,6 +14,7 @@ import torch
 from splatmill_worker import memory
 from splatmill_worker.images.lens import distortion
 from splatmill_worker.scene import Scene
+from splatmill_worker.splat.machine import resident_memory
 from splatmill_worker.splat.plan.light import Light, compared
 from splatmill_worker.splat.plan.observations import MAX_POINTS, Observations
 from splatmill_worker.splat.start.cells import cells_of
@@ -101,8 +102,8 @@ class Facts:
     halving_loss: median RMS difference between a photo and its half-size copy enlarged again, grey levels of 255.
     reprojection: median reprojection error, pixels; without stereo points.
     memory_available: memory that this process can still use, or free memory of the GPU for the gpu kernels, bytes.
-    memory_used: memory of this process when the plan is made, without files and libraries, bytes: what recovering the
-        cameras leaves behind stays, and so do photos that are not in files.
+    memory_used: memory of this process when the plan is made, bytes: the program and its libraries, what recovering
+        the cameras leaves behind, and photos that are not in files.
     light: exposure and white balance of the photos; None where too few show the same points.
     geometry: None where it is not known which photos show which points.
     coverage: None without enough points, or where photos are transparent.
@@ -183,7 +184,7 @@ def measure(scene: Scene, views: Sequence[TrainingView], held_out: int, speed: S
     sizes = np.array([[view.full.camera.width, view.full.camera.height] for view in views])
     width, height = (int(value) for value in np.median(sizes, axis=0))
     seen = Observations.of(scene, views)
-    return Facts(
+    facts = Facts(
         views=len(views),
         held_out=held_out,
         width=width,
@@ -204,11 +205,13 @@ def measure(scene: Scene, views: Sequence[TrainingView], held_out: int, speed: S
         alignment=_alignment(views),
         reprojection=_reprojection(scene, max(width, height)),
         lens_residual=_lens_residual(scene, max(width, height)),
-        memory_available=memory.available(),
-        memory_used=memory.used(),
+        memory_available=0,
         speed=speed,
         no_points=scene.facts.get("no_points"),
     )
+    del seen
+    memory.return_freed()  # of many photos, some hundred megabytes that training would not get
+    return replace(facts, memory_available=memory.available(), memory_used=resident_memory())
 
 
 def halving_loss(rgb: torch.Tensor) -> float:

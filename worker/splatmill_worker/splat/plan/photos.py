@@ -13,6 +13,8 @@ from splatmill.schema import (
     TrainOptions,
     format_bytes,
 )
+from splatmill_worker.kernels.cpu.loss import BYTES_PER_PIXEL as STATISTICS_PER_PIXEL
+from splatmill_worker.splat.engine.cpu import MOST_KEPT
 from splatmill_worker.splat.plan.facts import Facts
 from splatmill_worker.splat.plan.needs import FEW_VIEWS
 from splatmill_worker.splat.plan.plan import Kernels
@@ -78,6 +80,22 @@ def decide_photos_on_disk(facts: Facts) -> Decision[bool]:
         True,
         f"{photos}, more than an eighth of the memory. So they lie decoded in files, and steps read them ahead.",
     )
+
+
+def decide_statistics(facts: Facts, kernels: Kernels, pixels: float) -> Decision[int | None]:
+    """Memory for what the loss needs of each photo of `pixels` pixels alone; None: it is computed at every visit
+    (decisions: photo-statistics)."""
+    if kernels != "cpu":
+        return Decision(None, "")
+    size = round(STATISTICS_PER_PIXEL * pixels * facts.views)
+    words = f"What the loss needs of each photo alone takes {format_bytes(size)}"
+    if facts.photos_on_disk:
+        return Decision(None, f"{words}, and the photos lie in files. So it is computed at every visit.")
+    if size > MOST_KEPT:
+        return Decision(
+            MOST_KEPT, f"{words}, of which {format_bytes(MOST_KEPT)} are kept between its visits."
+        )
+    return Decision(size, f"{words}, which is kept between its visits.")
 
 
 def decide_image_size(facts: Facts, options: TrainOptions) -> Decision[int]:

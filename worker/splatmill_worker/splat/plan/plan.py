@@ -41,6 +41,7 @@ class Plan:
     gaps: Gaussians are added where photos show something that no point describes.
     pose_refinement: the cameras of training photos are corrected.
     cluster_culling: steps leave out clusters of Gaussians that the photo does not show.
+    photo_statistics: memory for what the loss needs of each photo alone, bytes; None: it is computed at every visit.
     validation: number of training photos that are set aside for `target_psnr` and `stops_when_flat`; None: neither.
     least_gain: dB, for `stops_when_flat`; 0 where training ends only once it over-fits.
     lpips: LPIPS of the held-out photos is measured at the end.
@@ -66,6 +67,7 @@ class Plan:
     gaps: bool = False
     pose_refinement: bool = False
     cluster_culling: bool = False
+    photo_statistics: int | None = None
     validation: int | None = None
     least_gain: float = 0.02
     lpips: bool = False
