@@ -9,7 +9,6 @@ from pydantic import ValidationError
 
 from splatmill.schema import ModelFrame
 from splatmill_worker.scene import Float
-from splatmill_worker.sfm.world.geodesy import to_earth_centered
 
 
 def place_beside(model: Path) -> Float | None:
@@ -24,5 +23,9 @@ def place_beside(model: Path) -> Float | None:
         return None
     if frame.origin is None or frame.unit != "metre":
         return None
+    from splatmill_worker.sfm.world.geodesy import (
+        to_earth_centered,
+    )  # loads COLMAP, which no other model needs
+
     place = np.array([frame.origin.latitude, frame.origin.longitude, frame.origin.altitude or 0.0])
     return to_earth_centered(place) if np.isfinite(place).all() else None

@@ -126,7 +126,7 @@ def test_it_lies_where_the_frame_of_the_model_says(tmp_path: Path) -> None:
     for x, y, z in scene.means[:5].double().numpy():
         found = (transform @ [x, z, -y, 1])[:3]
         place = geodesy.place(np.array([100 + x, 300 + z, 20 - y]), MUNICH)
-        np.testing.assert_allclose(found, geodesy.earth_centered(place[None])[0], atol=1e-6)
+        np.testing.assert_allclose(found, geodesy.to_earth_centered(place)[:3, 3], atol=1e-6)
 
 
 @pytest.mark.parametrize("degree", [0, 3])

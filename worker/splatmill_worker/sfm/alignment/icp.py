@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from splatmill_worker.colmap import pycolmap
 from splatmill_worker.scene import Float, Similarity
 from splatmill_worker.sfm.alignment.cloud import Cloud
 from splatmill_worker.sfm.world.georeference import umeyama
@@ -142,17 +143,7 @@ def _to_planes(
         system.append(np.sqrt(POINTS * weights)[:, None] * rows(np.broadcast_to(axis, arms.shape)))
         right.append(np.sqrt(POINTS * weights) * (errors @ axis))
     step = np.linalg.lstsq(np.concatenate(system), np.concatenate(right), rcond=None)[0]
-    rotation, growth, shift = _rotation(step[:3] / size), float(np.exp(step[3] / size)), step[4:]
+    rotation = pycolmap.Rotation3d(step[:3] / size).matrix()
+    growth, shift = float(np.exp(step[3] / size)), step[4:]
     change = Similarity(rotation, growth, middle + shift - growth * rotation @ middle)
     return similarity.then(change)
-
-
-def _rotation(vector: Float) -> Float:
-    """The rotation [3,3] about `vector` [3] by its length, in radians (Rodrigues)."""
-    angle = float(np.linalg.norm(vector))
-    if not angle > 0.0:
-        return np.eye(3)
-    x, y, z = vector / angle
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    turned: Float = np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
-    return turned

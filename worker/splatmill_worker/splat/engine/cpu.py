@@ -14,7 +14,7 @@ from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.views import over
 
 MOST_KEPT = 400 * 10**6
-"""Memory for the photos' statistics, bytes, where nothing else is said."""
+"""Memory for the photos' statistics, bytes, where no other is set."""
 
 
 class CpuEngine(Step):
