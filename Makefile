@@ -80,7 +80,7 @@ docs: $(VENV)/.installed-dev ## build the documentation into docs/build/html, wi
 	@echo "Open docs/build/html/index.html"
 
 screenshots: $(VENV)/.installed-dev ## make the documentation's pictures of the web page (needs a browser; some minutes)
-	$(BIN)/python docs/screenshots.py
+	PYTHONPATH=server $(BIN)/python -m docs.screenshots
 
 walk: $(VENV)/.installed-dev ## walk the pages as a new user, at three sizes and in two themes; pictures in demo/walk (some minutes)
 	PYTHONPATH=server $(BIN)/python -m tests.support.page.first_hour demo/walk

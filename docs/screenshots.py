@@ -6,12 +6,9 @@ It needs a browser (Debian: chromium-headless-shell) and some minutes. The pictu
 """
 
 import io
-import json
-import shutil
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 from typing import Any
 
@@ -19,21 +16,18 @@ import httpx
 from PIL import Image
 from playwright.sync_api import Error, Page, sync_playwright
 
+from tests.browser.conftest import FLAGS
+from tests.support.page.first_hour import DRAWN
+from tests.support.programs import program
+from tests.support.up import Up
+
 OUT = Path(__file__).parent / "web"
 WINDOW = {"width": 1200, "height": 800}
 WIDTH = 960
 """Pixels of a picture's width."""
 
-BROWSERS = ("chromium-headless-shell", "chromium", "google-chrome")
-FLAGS = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
 CHECKED = "() => /photos/.test(summary.textContent) && !/checked/.test(summary.textContent)"
 """Whether the page has looked at all photos."""
-
-DRAWN = """() => {
-  const view = document.querySelector(".view");
-  return view?.dataset.frames > 0 && !view.querySelector("img") && !view.querySelector(".said").textContent;
-}"""
-"""Whether the view shows the model, and neither its picture nor that it is being loaded."""
 
 PHOTOS = 30
 OPTIONS = {"time_budget": "60s"}
@@ -41,48 +35,32 @@ OPTIONS = {"time_budget": "60s"}
 
 def main() -> int:
     """Run the service, a job on it, and a browser over its pages."""
-    program = next((found for name in BROWSERS if (found := shutil.which(name))), None)
-    if program is None:
-        raise SystemExit(f"No browser is installed: none of {', '.join(BROWSERS)} is on PATH.")
     OUT.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         photos = Path(folder) / "photos"
         still_life = [sys.executable, "-m", "splatmill_worker.synthetic", str(photos), "--count", str(PHOTOS)]
         subprocess.run(still_life, check=True)
-        up = subprocess.Popen(
-            [
-                *(sys.executable, "-m", "splatmill_server.up"),
-                "--json-ready",
-                "--port",
-                "0",
-                "--data",
-                f"{folder}/data",
-            ],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        assert up.stdin is not None
-        assert up.stdout is not None
+        up = Up(Path(folder) / "data", {"SPLATMILL_PIPELINE": "splatmill_worker.pipeline"})
         try:
-            base = json.loads(up.stdout.readline())["url"]
-            with sync_playwright() as playwright, httpx.Client(base_url=base, timeout=60) as http:
-                browser = playwright.chromium.launch(executable_path=program, args=FLAGS)
+            base = str(up.start().http.base_url)
+            with sync_playwright() as playwright:
+                browser = playwright.chromium.launch(
+                    executable_path=program("chromium-headless-shell"), args=FLAGS
+                )
                 pages = {
                     theme: browser.new_context(base_url=base, color_scheme=theme, viewport=WINDOW).new_page()  # type: ignore[arg-type]  # both are themes
                     for theme in ("light", "dark")
                 }
                 for page in pages.values():
                     page.set_default_timeout(180_000)  # the job trains beside the browser
-                walk(pages, http, sorted(photos.glob("*.jpg")) or sorted(photos.glob("*.png")))
+                walk(pages, up, sorted(photos.glob("*.jpg")) or sorted(photos.glob("*.png")))
                 browser.close()
         finally:
-            up.stdin.close()  # ends the service
-            up.wait(60)
+            up.close()
     return 0
 
 
-def walk(pages: dict[str, Page], http: httpx.Client, photos: list[Path]) -> None:
+def walk(pages: dict[str, Page], up: Up, photos: list[Path]) -> None:
     """Take the pictures: photos given, a job while it trains, the lists, the model, and a link to it."""
     for theme, page in pages.items():
         page.goto("/")
@@ -90,22 +68,17 @@ def walk(pages: dict[str, Page], http: httpx.Client, photos: list[Path]) -> None
         page.locator("#photos li").nth(len(photos) - 1).wait_for(timeout=120_000)
         page.wait_for_function(CHECKED, timeout=300_000, polling=500)
         take(page, f"new-{theme}")
-    job = start(http, photos)
+    job = start(up.http, photos)
     for theme, page in pages.items():  # one after the other: each draws in software while the job trains
         page.goto(f"/jobs/{job}")
         page.get_by_text("The scene after").wait_for(timeout=600_000)
         page.wait_for_timeout(4000)
         take(page, f"job-{theme}")
         page.goto("about:blank")
-    ended = time.monotonic() + 900
-    while time.monotonic() < ended and (record := http.get(f"/v1/jobs/{job}").json())["state"] not in (
-        "succeeded",
-        "failed",
-    ):
-        time.sleep(2)
+    record = up.ended(job, 900)
     if record["state"] != "succeeded":
         raise SystemExit(f"The job ended as {record['state']}: {record.get('problem')}")
-    link = http.post(f"/v1/models/{job}/shares", json={"expires_in": "1h"}).json()["path"]
+    link = up.http.post(f"/v1/models/{job}/shares", json={"expires_in": "1h"}).json()["path"]
     for theme, page in pages.items():
         for name, address in (
             ("report", f"/jobs/{job}"),

@@ -64,7 +64,7 @@ MOST_FILES = 20
 FULLER = {
     "server/bench": 24,
     "server/splatmill_server/web/page": 21,
-    "worker/bench": 42,
+    "worker/bench": 41,
 }
 """Folders with more files than that, and how many at most. No folder is added, and no number grows."""
 
@@ -115,7 +115,9 @@ def test_importing_stays_cheap(module: str, forbidden: set[str]):
 def test_a_name_of_the_schema_is_one_thing_in_all_its_modules():
     """The package takes its names from its modules when the first is used, from whichever has them."""
     modules = [import_module(each.name) for each in walk_packages(schema.__path__, "splatmill.schema.")]
-    for name in schema.__all__:
+    exported = re.findall(r"\b(\w+) as \1\b", Path(schema.__file__).read_text())
+    assert len(exported) > 200
+    for name in exported:
         found = {id(vars(module)[name]) for module in modules if name in vars(module)}
         assert found == {id(getattr(schema, name))}, name
     with pytest.raises(AttributeError, match="no_such_name"):

@@ -9,14 +9,23 @@ from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
 
-if TYPE_CHECKING:
-    from splatmill.errors import JobCancelled, JobFailed, SplatmillError, WaitTimeout
-    from splatmill.schema import CameraSpec, OrbitRequest, RenderRequest, TrainOptions
-    from splatmill.sdk.aio import AsyncClient
-    from splatmill.sdk.client import Client, JobHandle, ModelHandle
-    from splatmill.sdk.job import AsyncJobHandle
-    from splatmill.sdk.model import AsyncModelHandle
-    from splatmill.sdk.webhook_signature import InvalidWebhook, verify_webhook
+if TYPE_CHECKING:  # `as` exports a name to type checkers
+    from splatmill.errors import JobCancelled as JobCancelled
+    from splatmill.errors import JobFailed as JobFailed
+    from splatmill.errors import SplatmillError as SplatmillError
+    from splatmill.errors import WaitTimeout as WaitTimeout
+    from splatmill.schema import CameraSpec as CameraSpec
+    from splatmill.schema import OrbitRequest as OrbitRequest
+    from splatmill.schema import RenderRequest as RenderRequest
+    from splatmill.schema import TrainOptions as TrainOptions
+    from splatmill.sdk.aio import AsyncClient as AsyncClient
+    from splatmill.sdk.client import Client as Client
+    from splatmill.sdk.client import JobHandle as JobHandle
+    from splatmill.sdk.client import ModelHandle as ModelHandle
+    from splatmill.sdk.job import AsyncJobHandle as AsyncJobHandle
+    from splatmill.sdk.model import AsyncModelHandle as AsyncModelHandle
+    from splatmill.sdk.webhook_signature import InvalidWebhook as InvalidWebhook
+    from splatmill.sdk.webhook_signature import verify_webhook as verify_webhook
 
 _MODULES = {
     "AsyncClient": "splatmill.sdk.aio",
@@ -37,25 +46,8 @@ _MODULES = {
     "WaitTimeout": "splatmill.errors",
 }
 
-__all__ = [
-    "AsyncClient",
-    "AsyncJobHandle",
-    "AsyncModelHandle",
-    "CameraSpec",
-    "Client",
-    "InvalidWebhook",
-    "JobCancelled",
-    "JobFailed",
-    "JobHandle",
-    "ModelHandle",
-    "OrbitRequest",
-    "RenderRequest",
-    "SplatmillError",
-    "TrainOptions",
-    "WaitTimeout",
-    "__version__",
-    "verify_webhook",
-]
+if not TYPE_CHECKING:
+    __all__ = [*_MODULES, "__version__"]
 
 
 def __getattr__(name: str) -> Any:
@@ -66,4 +58,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return __all__
+    return [*_MODULES, "__version__"]

@@ -20,12 +20,13 @@ SplatmillError
 └── ServiceFailed             the embedded service could not be started
 """
 
-from typing import TYPE_CHECKING
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
 
 from splatmill.schema.problems import Problem
 
-if TYPE_CHECKING:
-    from pydantic import ValidationError
+M = TypeVar("M", bound=BaseModel)
 
 
 class SplatmillError(Exception):
@@ -175,7 +176,20 @@ def error_for(problem: Problem, retry_after: float | None = None) -> Refused:
     return kind(problem, retry_after) if issubclass(kind, Unavailable) else kind(problem)
 
 
-def invalid_request(error: "ValidationError", code: str = "invalid_request") -> InvalidRequest:
+def valid_request(kind: type[M], values: Any, code: str = "invalid_request") -> M:
+    """Return the message of a kind with these values, or with those of a JSON text in bytes.
+
+    code: of the problem. Raises InvalidRequest, with one clause per value that the schema rejects.
+    """
+    try:
+        if isinstance(values, bytes):
+            return kind.model_validate_json(values)
+        return kind.model_validate(values)
+    except ValidationError as error:
+        raise invalid_request(error, code) from error
+
+
+def invalid_request(error: ValidationError, code: str = "invalid_request") -> InvalidRequest:
     """Return the error for values that the schema rejects before anything is sent, with one clause per value."""
     clauses = []
     for entry in error.errors(include_url=False):

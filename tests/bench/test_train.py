@@ -231,11 +231,11 @@ def test_a_level_is_reached_between_two_points_of_the_curve(parts: Any) -> None:
         {"seconds": s, "psnr": p}
         for s, p in ((1.0, 20.0), (2.0, None), (3.0, 24.0), (4.0, 23.0), (9.0, 30.0))
     ]
-    assert seconds_to({"curve": curve}, 22.0) == pytest.approx(2.0)
-    assert seconds_to({"curve": curve}, 24.0) == pytest.approx(3.0)
-    assert seconds_to({"curve": curve}, 26.5) == pytest.approx(6.5)
-    assert seconds_to({"curve": curve}, 12.0) == 1.0
-    assert seconds_to({"curve": curve}, 30.1) is None
+    assert seconds_to(curve, 22.0) == pytest.approx(2.0)
+    assert seconds_to(curve, 24.0) == pytest.approx(3.0)
+    assert seconds_to(curve, 26.5) == pytest.approx(6.5)
+    assert seconds_to(curve, 12.0) == 1.0
+    assert seconds_to(curve, 30.1) is None
 
 
 def like(row: Row, **changes: Any) -> Row:

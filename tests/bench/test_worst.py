@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import torch
 from _studies.stability.conditioning import Problem, Values
-from _studies.stability.extremes import FAMILIES, LENS, SIDE, decided, quaternion
+from _studies.stability.extremes import FAMILIES, LENS, SIDE, decided
 from _studies.stability.search import (
     HYPOTHESIS,
     OPTIMISER,
@@ -29,7 +29,6 @@ from _studies.stability.search import (
 )
 
 from splatmill_worker.kernels import ops
-from splatmill_worker.kernels.reference.project import rotation
 
 bench = importlib.import_module("worst")
 
@@ -50,13 +49,6 @@ def test_scenes_reach_the_image_from_far_off() -> None:
         far += bool((p.means2d.abs() > 1e4).any())
     assert seen >= 50
     assert far >= 30
-
-
-def test_a_quaternion_is_that_of_its_rotation() -> None:
-    q = torch.randn(50, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    q[0], q[1] = torch.tensor([0.0, 1, 0, 0]), torch.tensor([0.0, 0, -1, 0])
-    for R in rotation(q):
-        assert torch.allclose(rotation(quaternion(R)[None])[0], R, atol=1e-14)
 
 
 def test_a_scene_that_rounding_decides_about_is_left_out() -> None:

@@ -26,13 +26,8 @@ from splatmill.schema import Event, Job, JobState, Problem, StateEvent
 from splatmill_server.app import create_app
 from splatmill_server.base.settings import Settings
 from tests.support.redis_server import empty_redis
-from tests.support.servers.scripted_server import Reply, ScriptedServer, scripted_server
-
-
-@pytest.fixture
-def peer() -> Iterator[ScriptedServer]:
-    with scripted_server() as server:
-        yield server
+from tests.support.servers.scripted_server import Reply
+from tests.support.servers.scripted_server import peer as peer
 
 
 @pytest.fixture

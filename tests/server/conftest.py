@@ -16,6 +16,9 @@ from splatmill_server.base.settings import Settings
 from tests.support.redis_server import empty_redis
 from tests.support.redis_server import redis_server as redis_server
 from tests.support.served_app import Serve, ServedApp, served_app
+from tests.support.servers.rendering import folder as folder
+from tests.support.servers.rendering import renderer as renderer
+from tests.support.servers.scripted_server import peer as peer
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -5,7 +5,6 @@ tests/worker, and how good models get is measured by worker/bench.
 """
 
 import io
-import json
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +16,8 @@ from PIL import Image
 from splatmill_worker import synthetic
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.scene import Camera
+from tests.support.posed_sets import document
+from tests.support.scenes.photos import psnr
 from tests.support.up import Up
 from tests.support.waiting import gone, wait_for
 
@@ -48,28 +49,12 @@ def upload(up: Up, folder: Path) -> str:
     return capture
 
 
-def transforms(cameras: dict[str, Camera]) -> bytes:
-    """The cameras as a nerfstudio transforms.json: camera-to-world with OpenGL axes."""
-    flip = np.diag([1.0, -1.0, -1.0, 1.0])
-    frames = [
-        {"file_path": f"images/{name}", "transform_matrix": (np.linalg.inv(c.viewmat) @ flip).tolist()}
-        for name, c in cameras.items()
-    ]
-    one = next(iter(cameras.values()))
-    lens = {"w": one.width, "h": one.height, "fl_x": one.fx, "fl_y": one.fy, "cx": one.cx, "cy": one.cy}
-    return json.dumps(lens | {"frames": frames}).encode()
-
-
-def psnr(image: np.ndarray, photo: np.ndarray) -> float:
-    return float(10 * np.log10(255**2 / np.mean((image.astype(float) - photo.astype(float)) ** 2)))
-
-
 def test_posed_photos_become_a_model_whose_views_match_them(
     true_service: Up, photos: tuple[Path, dict[str, Camera]]
 ) -> None:
     up, (folder, cameras) = true_service, photos
     capture = upload(up, folder)
-    answer = up.http.put(f"/v1/captures/{capture}/poses/transforms.json", content=transforms(cameras))
+    answer = up.http.put(f"/v1/captures/{capture}/poses/transforms.json", json=document(cameras))
     assert answer.status_code == 201, answer.text
     answer = up.http.post("/v1/jobs", json={"capture": capture, "options": {"steps": 150} | SMALL})
     job_id = answer.json()["id"]

@@ -35,6 +35,12 @@ def read_job(connection: redis.Redis, job_id: str) -> Job:
     return fold(row, states, events.last_progress(connection, job_id))
 
 
+def read_progress(connection: redis.Redis, job_id: str) -> list[events.StoredEvent]:
+    """Return the entries of a job's progress stream that were not trimmed, oldest first."""
+    key = keys.progress(job_id)
+    return events.decode(cast(Any, connection.xrange(key)), key)
+
+
 def messages(connection: redis.Redis, job_id: str) -> list[str]:
     """Return the job's log lines."""
     logged = [stored.event for stored in events.read_log(connection, job_id)]

@@ -3,14 +3,14 @@
 import json
 import math
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
-from splatmill_worker.scene import Float, Scene
+from splatmill_worker.scene import Camera, Float, Scene
 from splatmill_worker.sfm import posed
 
 COUNT = 12
@@ -52,17 +52,27 @@ def model(
     (folder / "points3D.txt").write_bytes(change(f"# points\n7 1 2 3 9 9 9 0.5 {track}\n"))
 
 
+def frame_of(name: str, viewmat: Float, **fields: Any) -> dict[str, Any]:
+    """The frame of a transforms.json for a world-to-camera matrix: from camera to world, with OpenGL axes."""
+    matrix = np.linalg.inv(viewmat) @ FLIP
+    return {"file_path": f"images/{name}", "transform_matrix": matrix.tolist(), **fields}
+
+
+def document(cameras: Mapping[str, Camera]) -> dict[str, Any]:
+    """The transforms.json of photos with these cameras, which have one lens."""
+    one = next(iter(cameras.values()))
+    lens = {"w": one.width, "h": one.height, "fl_x": one.fx, "fl_y": one.fy, "cx": one.cx, "cy": one.cy}
+    return {**lens, "frames": [frame_of(name, camera.viewmat) for name, camera in cameras.items()]}
+
+
 def frames(names: list[str] = NAMES) -> list[dict[str, Any]]:
-    return [
-        {"file_path": f"images/{name}", "transform_matrix": (np.linalg.inv(viewmat(k)) @ FLIP).tolist()}
-        for k, name in enumerate(names)
-    ]
+    return [frame_of(name, viewmat(k)) for k, name in enumerate(names)]
 
 
 def transforms(path: Path, of: list[Any] | None = None, change: Callable[[str], bytes] = str.encode) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    document = {"w": 64, "h": 48, "fl_x": 60, "fl_y": 61, "cx": 32, "cy": 24, "frames": of or frames()}
-    path.write_bytes(change(json.dumps(document)))
+    lens = {"w": 64, "h": 48, "fl_x": 60, "fl_y": 61, "cx": 32, "cy": 24}
+    path.write_bytes(change(json.dumps({**lens, "frames": of or frames()})))
 
 
 def loaded(capture: Path) -> Scene:

@@ -14,6 +14,7 @@ from splatmill_worker.images.load import Photo
 from splatmill_worker.scene import Camera, Normalization, Scene, View
 from splatmill_worker.splat.views import TrainingView
 from splatmill_worker.synthetic import orbit, photograph, still_life
+from tests.support.posed_sets import document
 
 WIDTH, HEIGHT, COUNT = 96, 72, 14
 POINTS = 1500
@@ -65,14 +66,11 @@ def posed_capture(directory: Path, offset: tuple[float, float, float] = (0.0, 0.
     """A capture on disk: images/ and poses/transforms.json, in OpenGL axes as other tools write them, all moved."""
     (directory / "images").mkdir(parents=True)
     (directory / "poses").mkdir()
-    frames = []
-    for i, (camera, rgb, _) in enumerate(pictures()):
+    for i, (_, rgb, _) in enumerate(pictures()):
         Image.fromarray(rgb).save(directory / "images" / f"{i:02d}.png")
-        matrix = np.eye(4)
-        matrix[:3, :3] = camera.viewmat[:3, :3].T @ np.diag([1.0, -1.0, -1.0])
-        matrix[:3, 3] = camera.center + np.array(offset)
-        frames.append({"file_path": f"images/{i:02d}.png", "transform_matrix": matrix.tolist()})
-    camera = pictures()[0][0]
-    lens = {"w": WIDTH, "h": HEIGHT, "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
-    (directory / "poses" / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
+    whole = document({f"{i:02d}.png": camera for i, (camera, _, _) in enumerate(pictures())})
+    for frame in whole["frames"]:
+        for axis in range(3):
+            frame["transform_matrix"][axis][3] += offset[axis]
+    (directory / "poses" / "transforms.json").write_text(json.dumps(whole))
     return directory

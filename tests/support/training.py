@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pytest
 
 from splatmill_worker.scene import Normalization, PointViews, Scene
 from splatmill_worker.splat.engine.open import open_engine
@@ -14,6 +15,7 @@ from splatmill_worker.splat.plan.budget import Budget
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.plan.schedule import Schedule
 from splatmill_worker.splat.start.points import from_points
+from splatmill_worker.splat.train import curve
 from splatmill_worker.splat.views import TrainingView
 from tests.support import still_life
 
@@ -67,3 +69,9 @@ def sparse_scene() -> tuple[Scene, list[TrainingView]]:
     ]
     tracks = PointViews(np.cumsum([0, *map(len, rows)]), np.concatenate(rows).astype(np.int32))
     return replace(world, points=points, colors=world.colors[::5], point_views=tracks), views
+
+
+@pytest.fixture(autouse=True)
+def gains_of_short_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Gains are measured from the first step on, in the files that import this."""
+    monkeypatch.setattr(curve, "GAIN_FROM", 0)

@@ -1,4 +1,4 @@
-"""`splatmill up` as the service's tests run it: a real process with real Redis, real HTTP and a stand-in pipeline."""
+"""`splatmill up`, and a worker alone, as tests run them: real processes, Redis and HTTP with a stand-in pipeline."""
 
 import contextlib
 import json
@@ -7,22 +7,66 @@ import resource
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import httpx
 import psutil
 import redis
 
 from splatmill.backplane.connection import connect
+from splatmill.backplane.storage import layout
+from splatmill.backplane.storage.storage import Storage
+from splatmill.schema import Role
+from tests.support.jobs import CAPTURE
 from tests.support.paths import ROOT
+from tests.support.redis_server import RedisServer
 from tests.support.waiting import wait_for
 
 FINAL = {"succeeded", "failed", "cancelled"}
 
 STANDIN = {"SPLATMILL_PIPELINE": "tests.support.servers.standin", "PYTHONPATH": str(ROOT)}
 """The environment of a worker that runs tests/support/servers/standin.py instead of the engine."""
+
+
+def scripted(folder: Path, **script: Any) -> Storage:
+    """Storage in a folder, with CAPTURE, which the stand-in trains as a script says, and `diary` for its attempts."""
+    storage = Storage((folder / "storage").as_uri())
+    text = json.dumps({"diary": str(folder / "diary")} | script)
+    storage.put(layout.capture_file(CAPTURE, Role.images, "script.json"), text.encode())
+    return storage
+
+
+def worker_environment(server: RedisServer, storage: Storage, folder: Path, **more: str) -> dict[str, str]:
+    """The environment of a worker that runs the stand-in, with its data in a folder whose modules it finds."""
+    return {
+        **os.environ,
+        **STANDIN,
+        "PYTHONPATH": f"{ROOT}{os.pathsep}{folder}",
+        "REDIS_URL": server.url,
+        "SPLATMILL_STORAGE": storage.url,
+        "SPLATMILL_DATA": str(folder / "data"),
+        **more,
+    }
+
+
+@contextlib.contextmanager
+def running_worker(
+    environment: Mapping[str, str],
+    *options: str,
+    program: Sequence[str] = ("-m", "splatmill_worker", "train"),
+    stderr: IO[bytes] | None = None,
+    may_end: bool = False,
+) -> Iterator[subprocess.Popen[bytes]]:
+    """A worker. It must still run at the end, unless it may end."""
+    process = subprocess.Popen([sys.executable, *program, *options], env=environment, stderr=stderr)
+    try:
+        yield process
+        assert may_end or process.poll() is None
+    finally:
+        process.terminate()
+        process.wait(30)
 
 
 class Up:

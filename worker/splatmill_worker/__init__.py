@@ -6,20 +6,27 @@ A name is imported when it is first used, so that the programs of the worker sta
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:
-    from splatmill_worker.images.load import load_views
-    from splatmill_worker.kernels import ops
-    from splatmill_worker.pipeline import run
-    from splatmill_worker.scene import Camera, Normalization, Scene, View, split
-    from splatmill_worker.sfm import SfmOptions, reconstruct
-    from splatmill_worker.splat.engine.open import open_engine
-    from splatmill_worker.splat.evaluate import evaluate
-    from splatmill_worker.splat.formats.registry import read, write
-    from splatmill_worker.splat.gaussians import Gaussians
-    from splatmill_worker.splat.plan.rates import Annealing, RateSchedule
-    from splatmill_worker.splat.render import render
-    from splatmill_worker.splat.start.points import from_points
-    from splatmill_worker.splat.views import TrainingView
+if TYPE_CHECKING:  # `as` exports a name to type checkers
+    from splatmill_worker.images.load import load_views as load_views
+    from splatmill_worker.kernels import ops as ops
+    from splatmill_worker.pipeline import run as run
+    from splatmill_worker.scene import Camera as Camera
+    from splatmill_worker.scene import Normalization as Normalization
+    from splatmill_worker.scene import Scene as Scene
+    from splatmill_worker.scene import View as View
+    from splatmill_worker.scene import split as split
+    from splatmill_worker.sfm import SfmOptions as SfmOptions
+    from splatmill_worker.sfm import reconstruct as reconstruct
+    from splatmill_worker.splat.engine.open import open_engine as open_engine
+    from splatmill_worker.splat.evaluate import evaluate as evaluate
+    from splatmill_worker.splat.formats.registry import read as read
+    from splatmill_worker.splat.formats.registry import write as write
+    from splatmill_worker.splat.gaussians import Gaussians as Gaussians
+    from splatmill_worker.splat.plan.rates import Annealing as Annealing
+    from splatmill_worker.splat.plan.rates import RateSchedule as RateSchedule
+    from splatmill_worker.splat.render import render as render
+    from splatmill_worker.splat.start.points import from_points as from_points
+    from splatmill_worker.splat.views import TrainingView as TrainingView
 
 _MODULES = {
     "Annealing": "splat.plan.rates",
@@ -44,28 +51,8 @@ _MODULES = {
     "write": "splat.formats.registry",
 }
 
-__all__ = [
-    "Annealing",
-    "Camera",
-    "Gaussians",
-    "Normalization",
-    "RateSchedule",
-    "Scene",
-    "SfmOptions",
-    "TrainingView",
-    "View",
-    "evaluate",
-    "from_points",
-    "load_views",
-    "open_engine",
-    "ops",
-    "read",
-    "reconstruct",
-    "render",
-    "run",
-    "split",
-    "write",
-]
+if not TYPE_CHECKING:
+    __all__ = [*_MODULES]
 
 
 def __getattr__(name: str) -> Any:
@@ -76,4 +63,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return __all__
+    return [*_MODULES]

@@ -2,9 +2,7 @@
 
 import asyncio
 
-from pydantic import ValidationError
-
-from splatmill.errors import Refused, invalid_request
+from splatmill.errors import Refused, valid_request
 from splatmill.schema import Capture, CreateImport, Import, ImportList, Progress, Role
 from splatmill.transfer.connection import Connection, read_answer
 from splatmill.transfer.uploads import OnProgress
@@ -39,10 +37,7 @@ class AsyncImports:
         Raises NotFound, and InvalidRequest for an address that the server does not use.
         """
         body = {"url": url, "role": role, "name": name, "sha256": sha256}
-        try:
-            request = CreateImport.model_validate(body)
-        except ValidationError as error:
-            raise invalid_request(error) from error
+        request = valid_request(CreateImport, body)
         target = capture or await self._new_capture(url)
         try:
             response = await self._connection.request(

@@ -1,11 +1,9 @@
 """The keys of a server: `AsyncClient.keys` and `Client.keys`, for callers with the scope admin."""
 
 from collections.abc import Iterable, Mapping
-from typing import Any, TypeVar
+from typing import Any
 
-from pydantic import ValidationError
-
-from splatmill.errors import invalid_request
+from splatmill.errors import valid_request
 from splatmill.schema import (
     DEFAULT_OWNER,
     CreateKey,
@@ -17,8 +15,6 @@ from splatmill.schema import (
     Scope,
 )
 from splatmill.transfer.connection import Connection, read_answer
-
-R = TypeVar("R", CreateKey, RotateKey)
 
 
 class AsyncKeys:
@@ -43,7 +39,7 @@ class AsyncKeys:
         """
         limit_values = limits.model_dump() if isinstance(limits, KeyLimits) else dict(limits or {})
         body = {"name": name, "owner": owner, "scopes": list(scopes), "limits": limit_values}
-        request = _checked(CreateKey, body)
+        request = valid_request(CreateKey, body)
         # It is sent once: repeated after a lost answer, it would leave a key that nobody knows of.
         response = await self._connection.request("POST", "/v1/keys", json=request.model_dump(mode="json"))
         return read_answer(KeyWithSecret, response)
@@ -61,14 +57,7 @@ class AsyncKeys:
 
     async def rotate(self, key_id: str, *, grace: float | str = 0.0) -> KeyWithSecret:
         """Give a key a new secret. The former one stays valid for `grace`: seconds, or a text such as `1h`."""
-        request = _checked(RotateKey, {"grace": grace})
+        request = valid_request(RotateKey, {"grace": grace})
         path = f"/v1/keys/{key_id}/rotate"
         response = await self._connection.request("POST", path, json=request.model_dump(mode="json"))
         return read_answer(KeyWithSecret, response)
-
-
-def _checked(kind: type[R], body: Mapping[str, Any]) -> R:
-    try:
-        return kind.model_validate(body)
-    except ValidationError as error:
-        raise invalid_request(error) from error

@@ -4,9 +4,7 @@ import asyncio
 from pathlib import Path
 from typing import Unpack
 
-from pydantic import ValidationError
-
-from splatmill.errors import error_for, invalid_request
+from splatmill.errors import error_for, valid_request
 from splatmill.schema import Mesh, MeshList, MeshRequest, Progress
 from splatmill.sdk.arguments import MeshArguments
 from splatmill.transfer.connection import Connection, read_answer
@@ -30,10 +28,7 @@ class AsyncMeshes:
         `options` are the fields of `MeshRequest`. The same options return the same mesh, also one that is whole. Raises
         InvalidRequest for options that are not valid, and Conflict where there are too many meshes.
         """
-        try:
-            content = MeshRequest.model_validate(options).model_dump(mode="json", exclude_none=True)
-        except ValidationError as error:
-            raise invalid_request(error) from error
+        content = valid_request(MeshRequest, options).model_dump(mode="json", exclude_none=True)
         response = await self._connection.request("POST", self._path, json=content, repeatable=True)
         return read_answer(Mesh, response)
 

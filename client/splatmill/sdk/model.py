@@ -7,9 +7,8 @@ from typing import Any, Unpack
 from urllib.parse import quote
 
 import httpx
-from pydantic import ValidationError
 
-from splatmill.errors import WaitTimeout, invalid_request
+from splatmill.errors import WaitTimeout, valid_request
 from splatmill.files import atomic_write
 from splatmill.schema import (
     Box,
@@ -31,7 +30,7 @@ from splatmill.schema import (
 )
 from splatmill.sdk.arguments import MeshArguments, OrbitArguments, PresentationArguments, RenderArguments
 from splatmill.sdk.meshes import AsyncMeshes
-from splatmill.sdk.orbits import AsyncOrbits, orbit_request
+from splatmill.sdk.orbits import AsyncOrbits
 from splatmill.sdk.shares import AsyncShares
 from splatmill.transfer.connection import Connection, read_answer
 from splatmill.transfer.downloads import AnyPath, OnBytes, download, target_of
@@ -46,10 +45,7 @@ ORBIT_TIMEOUT = httpx.Timeout(30.0, read=900.0)
 def label_changes(tags: Sequence[str] | None, favourite: bool | None) -> dict[str, Any]:
     """Return the request that changes the tags and the star; None leaves one as it is. Raises InvalidRequest."""
     changes = {name: value for name, value in (("tags", tags), ("favourite", favourite)) if value is not None}
-    try:
-        return ChangeLabels.model_validate(changes).model_dump(mode="json", exclude_unset=True)
-    except ValidationError as error:
-        raise invalid_request(error) from error
+    return valid_request(ChangeLabels, changes).model_dump(mode="json", exclude_unset=True)
 
 
 class AsyncModelHandle:
@@ -146,10 +142,7 @@ class AsyncModelHandle:
 
         Raises InvalidRequest for values that are not valid.
         """
-        try:
-            request = ChangePresentation.model_validate(changes)
-        except ValidationError as error:
-            raise invalid_request(error) from error
+        request = valid_request(ChangePresentation, changes)
         response = await self.connection.request(
             "PATCH",
             f"/v1/models/{self.id}/presentation",
@@ -168,10 +161,7 @@ class AsyncModelHandle:
         `options` are output, format, background and quality of `RenderRequest`. Raises InvalidRequest for a camera or
         options that are not valid.
         """
-        try:
-            request = RenderRequest.model_validate({**options, "camera": camera})
-        except ValidationError as error:
-            raise invalid_request(error, "camera_invalid") from error
+        request = valid_request(RenderRequest, {**options, "camera": camera}, "camera_invalid")
         response = await self.connection.request(
             "POST",
             f"/v1/models/{self.id}/render",
@@ -205,7 +195,8 @@ class AsyncModelHandle:
         """
         target = target_of(path, "orbit.mp4")
         if not keep:
-            return await self._orbit_for_this_call(target, timeout, orbit_request(options))
+            request = valid_request(OrbitRequest, options)
+            return await self._orbit_for_this_call(target, timeout, request)
         begun = await self.orbits.start(**options)
         try:
             async with asyncio.timeout(timeout) as limit:
@@ -289,10 +280,7 @@ class AsyncModelHandle:
             "name": name,
             "preview": preview,
         }
-        try:
-            request = EditModel.model_validate(values)
-        except ValidationError as error:
-            raise invalid_request(error) from error
+        request = valid_request(EditModel, values)
         # Repeated after a lost answer, it would make a second model, so only a preview is.
         response = await self.connection.request(
             "POST",

@@ -4,9 +4,7 @@ import asyncio
 from pathlib import Path
 from typing import Unpack
 
-from pydantic import ValidationError
-
-from splatmill.errors import error_for, invalid_request
+from splatmill.errors import error_for, valid_request
 from splatmill.schema import Orbit, OrbitList, OrbitRequest, Progress
 from splatmill.sdk.arguments import OrbitArguments
 from splatmill.transfer.connection import Connection, read_answer
@@ -15,14 +13,6 @@ from splatmill.transfer.uploads import OnProgress
 
 _POLL_SECONDS = 0.2
 _LONGEST_POLL = 2.0
-
-
-def orbit_request(options: OrbitArguments) -> OrbitRequest:
-    """Return the request with these options. Raises InvalidRequest for options that are not valid."""
-    try:
-        return OrbitRequest.model_validate(options)
-    except ValidationError as error:
-        raise invalid_request(error) from error
 
 
 class AsyncOrbits:
@@ -38,7 +28,7 @@ class AsyncOrbits:
         `options` are the fields of `OrbitRequest`. The same options return the same video, also one that is whole.
         Raises InvalidRequest for options that are not valid, and Conflict where there are too many videos.
         """
-        content = orbit_request(options).model_dump(mode="json", exclude_none=True)
+        content = valid_request(OrbitRequest, options).model_dump(mode="json", exclude_none=True)
         response = await self._connection.request("POST", self._path, json=content, repeatable=True)
         return read_answer(Orbit, response)
 

@@ -1,8 +1,6 @@
 """The links to a model: `AsyncModelHandle.shares` and `ModelHandle.shares`."""
 
-from pydantic import ValidationError
-
-from splatmill.errors import invalid_request
+from splatmill.errors import valid_request
 from splatmill.schema import CreateShare, Share, ShareList, ShareWithToken
 from splatmill.transfer.connection import Connection, read_answer
 
@@ -24,10 +22,7 @@ class AsyncShares:
 
         Raises InvalidRequest for a time that is not valid.
         """
-        try:
-            request = CreateShare.model_validate({"expires_in": expires_in, "name": name, "photos": photos})
-        except ValidationError as error:
-            raise invalid_request(error) from error
+        request = valid_request(CreateShare, {"expires_in": expires_in, "name": name, "photos": photos})
         # It is sent once: repeated after a lost answer, it would leave a link that nobody knows of.
         response = await self._connection.request("POST", self._path, json=request.model_dump(mode="json"))
         return read_answer(ShareWithToken, response)

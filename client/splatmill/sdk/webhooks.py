@@ -2,9 +2,7 @@
 
 from collections.abc import Iterable
 
-from pydantic import ValidationError
-
-from splatmill.errors import invalid_request
+from splatmill.errors import valid_request
 from splatmill.schema import (
     CreateWebhook,
     Delivery,
@@ -35,10 +33,7 @@ class AsyncWebhooks:
         Raises InvalidRequest for an address that the server sends nothing to.
         """
         body = {"url": url, "name": name} | ({} if events is None else {"events": list(events)})
-        try:
-            request = CreateWebhook.model_validate(body)
-        except ValidationError as error:
-            raise invalid_request(error) from error
+        request = valid_request(CreateWebhook, body)
         # It is sent once: repeated after a lost answer, it would leave a webhook whose secret nobody knows.
         response = await self._connection.request("POST", PATH, json=request.model_dump(mode="json"))
         return read_answer(WebhookWithSecret, response)

@@ -32,26 +32,16 @@ from splatmill.schema import (
     describe_options,
 )
 from splatmill.sdk.client import Client
+from tests.client.cli.conftest import PLY
 from tests.support.command_line import invoke, spawn
 from tests.support.waiting import wait_for
 
-PLY = b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nend_header\n\0\0\0\0"
 PLAN = {
     "image_size": 480,
     "schedule": {"degree": 1},
     "reasons": {"image_size": "The photos resolve no more.", "degree": "The views span 20 degrees."},
     "left_out": {"exposure": "Exposures agree."},
 }
-
-
-@pytest.fixture
-def photos(tmp_path: Path) -> Path:
-    folder = tmp_path / "photos"
-    folder.mkdir()
-    for n in range(3):
-        (folder / f"{n}.jpg").write_bytes(bytes([n]) * 1000)
-    (folder / "notes.txt").write_text("not a photo")
-    return folder
 
 
 def newest(service) -> str | None:

@@ -17,19 +17,10 @@ from splatmill.backplane.storage import layout
 from splatmill.cli.exits import Exit
 from splatmill.schema import EventRecord, JobState, LogEvent, Problem, ProgressEvent, StateEvent
 from splatmill.sdk.client import Client
+from tests.client.cli.conftest import PLY
 from tests.support.command_line import invoke, on_terminal, spawn
 
-PLY = b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nend_header\n\0\0\0\0"
 LONG = "the kitchen of the old house by the lake, second floor, at noon"
-
-
-@pytest.fixture
-def photos(tmp_path: Path) -> Path:
-    folder = tmp_path / "photos"
-    folder.mkdir()
-    for n in range(3):
-        (folder / f"{n}.jpg").write_bytes(bytes([n]) * 1000)
-    return folder
 
 
 @pytest.fixture

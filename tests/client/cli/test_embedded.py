@@ -6,7 +6,6 @@ Does not prove what the service does with a job; tests/service does. Here a job 
 
 import json
 import os
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -17,10 +16,12 @@ import psutil
 import pytest
 
 from splatmill import Client
+from splatmill.cli.commands import service as commands
 from splatmill.cli.exits import Exit
 from splatmill.cli.local.embedded import ServiceAddress, embedded_service
 from splatmill.cli.local.folder_lock import locked
 from splatmill.errors import ServiceFailed, Unauthorized
+from tests.support.command_line import invoke
 
 pytestmark = pytest.mark.slow
 
@@ -110,10 +111,8 @@ def test_photos_that_are_none_fail_with_a_sentence(tmp_path: Path):
     assert "The training is kept in" in done.stderr
 
 
-def test_up_refuses_a_port_in_use(tmp_path: Path):
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = str(taken.getsockname()[1])
-        command = [sys.executable, "-m", "splatmill", "up", "--port", port, "--data", str(tmp_path)]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=60)
-    assert done.returncode == 1
-    assert f"Port {port} on 127.0.0.1 is in use" in done.stderr
+def test_up_becomes_the_supervisor_with_its_arguments(monkeypatch: pytest.MonkeyPatch):
+    handed: list[tuple[str, ...]] = []
+    monkeypatch.setattr(commands, "exec_module", lambda *words: handed.append(words))
+    assert invoke("up", "--port", "1", "--data", "somewhere").exit_code == 0
+    assert handed == [("splatmill_server.up", "--port", "1", "--data", "somewhere")]

@@ -8,14 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.ball import write_ply
 from tests.support.command_line import invoke, spawn
-
-
-@pytest.fixture
-def ball(tmp_path: Path) -> Path:
-    write_ply(tmp_path / "ball.ply", 500)
-    return tmp_path / "ball.ply"
 
 
 @pytest.mark.parametrize(

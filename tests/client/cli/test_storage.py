@@ -53,7 +53,7 @@ def test_the_command_prints_owners_and_the_largest_records(service: Service, tmp
     assert lines[0] == ["owner", "total", "captures", "cameras", "jobs", "models", "uploads", "limit"]
     assert lines[1][:3] == ["default", "10.3", "kB"]
     found = next(line for line in lines if capture in line)
-    assert found[:4] == ["capture", capture, "garden", "default"]
+    assert found[:4] == [capture, "garden", "capture", "default"]
     assert found[-2:] == ["on", "request"]
     assert "The next sweep deletes nothing." in shown.output
     as_json = CliRunner().invoke(app, ["storage", "--server", service.url, "--json"], env=WIDE)
@@ -99,10 +99,10 @@ def test_planned_deletions_and_expiries_are_shown_with_whole_ids(peer, reply) ->
     lines = [" ".join(line.split()) for line in shown.output.splitlines()]
     assert "lab 3.0 MB 0 B 0 B 0 B 0 B 0 B 5.0 MB" in lines
     assert "(nobody) 7 B 0 B 0 B 0 B 0 B 0 B none" in lines
-    assert f"capture {capture} lab 2.0 MB 40 d ago by the next sweep" in lines
-    assert f"model {model} lab 2.0 MB 40 d ago in 10 d" in lines
+    assert f"{capture} capture lab 2.0 MB 40 d ago by the next sweep" in lines
+    assert f"{model} model lab 2.0 MB 40 d ago in 10 d" in lines
     assert "The next sweep deletes 2.0 MB:" in lines
-    assert lines[-1] == f"capture {capture} 2.0 MB It was not used for 30 days."
+    assert lines[-1] == f"{capture} capture 2.0 MB It was not used for 30 days."
 
 
 def _later(now: datetime, *, days: float) -> str:

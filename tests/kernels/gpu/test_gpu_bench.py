@@ -128,7 +128,7 @@ def test_the_scene_fills_its_view(bench: ModuleType) -> None:
 
 
 def test_gsplats_schedule_is_its_documented_default() -> None:
-    import _gsplat as other
+    from _gpu import gsplat as other
 
     assert other.position_rate(0, 30_000, 2.0) == pytest.approx(3.2e-4)
     assert other.position_rate(30_000, 30_000, 2.0) == pytest.approx(3.2e-6)
@@ -137,14 +137,6 @@ def test_gsplats_schedule_is_its_documented_default() -> None:
     order = other.order(7, 20, seed=3)
     assert len(order) == 20
     assert sorted(order[:7]) == sorted(order[7:14]) == list(range(7))
-
-
-def test_time_to_a_target_lies_on_the_curve(bench: ModuleType) -> None:
-    curve = [{"seconds": 1.0, "psnr": 20.0}, {"seconds": 3.0, "psnr": 24.0}, {"seconds": 9.0, "psnr": 25.0}]
-    assert bench.compared.seconds_to(curve, 19.0) == 1.0
-    assert bench.compared.seconds_to(curve, 22.0) == pytest.approx(2.0)
-    assert bench.compared.seconds_to(curve, 24.5) == pytest.approx(6.0)
-    assert bench.compared.seconds_to(curve, 26.0) is None
 
 
 def test_the_verdict_compares_at_equal_quality(bench: ModuleType) -> None:

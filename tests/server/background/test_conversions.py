@@ -9,7 +9,6 @@ from __future__ import annotations
 import base64
 import signal
 import subprocess
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -32,8 +31,8 @@ from splatmill_server.responses.single_file import WEB
 from splatmill_worker.splat.formats import registry
 from tests.support.ball import write_ply
 from tests.support.command_line import invoke
-from tests.support.served_app import Serve, ServedApp, problem, store_model
-from tests.support.servers.rendering import hold_out, renderer_in
+from tests.support.served_app import Serve, ServedApp, problem
+from tests.support.servers.rendering import hold_out, serve_in, store_only_ball
 from tests.support.servers.scripted_server import Reply, scripted_server
 from tests.support.waiting import wait_for
 
@@ -43,25 +42,10 @@ MODEL = "a" * 16
 VIEWS = [CameraSpec.looking_at((4, side, 0), (0, 0, 0), width=96, height=64) for side in (0, 1, 2)]
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("conversions")
-
-
-@pytest.fixture(scope="module")
-def renderer(folder: Path) -> Iterator[subprocess.Popen[bytes]]:
-    with renderer_in(folder) as process:
-        yield process
-
-
 @pytest.fixture
 def app(serve: Serve, folder: Path, renderer: subprocess.Popen[bytes]) -> ServedApp:
-    running = serve(renderer_url=f"unix:{folder}/r.sock", storage=str(folder / "storage"))
-    storage = running.service.storage
-    storage.delete_prefix(layout.model(MODEL))
-    store_model(running.service, MODEL)
-    write_ply(folder / "model.ply")
-    storage.put(layout.model_file(MODEL, "model.ply"), folder / "model.ply")
+    running = serve_in(serve, folder)
+    store_only_ball(running, folder, MODEL)
     return running
 
 
@@ -117,7 +101,7 @@ def test_without_held_out_photos_pictures_of_the_model_are_compared(app: ServedA
 def test_requests_at_once_in_two_api_processes_make_one_conversion(
     app: ServedApp, serve: Serve, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    other = serve(renderer_url=f"unix:{folder}/r.sock", storage=str(folder / "storage"))
+    other = serve_in(serve, folder)
     stored = []
     for each in (app, other):
         assert (

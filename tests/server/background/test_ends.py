@@ -4,7 +4,6 @@ In these tests the reaper and the loop of deliveries look once an hour, so that 
 here: what a delivery holds, and how it is repeated (tests/server/test_webhooks).
 """
 
-from collections.abc import Iterator
 from datetime import datetime
 from typing import Any
 
@@ -20,16 +19,10 @@ from splatmill_server.background import deliveries
 from splatmill_server.jobs.records import Jobs
 from tests.support.served_app import Serve, ServedApp
 from tests.support.servers.queue_entries import take
-from tests.support.servers.scripted_server import Reply, ScriptedServer, scripted_server
+from tests.support.servers.scripted_server import Reply, ScriptedServer
 from tests.support.waiting import wait_for
 
 FAILED = StateEvent(state=JobState.failed, problem=Problem.of("diverged", "It went wrong."))
-
-
-@pytest.fixture
-def peer() -> Iterator[ScriptedServer]:
-    with scripted_server() as server:
-        yield server
 
 
 @pytest.fixture

@@ -1,14 +1,13 @@
 """Meshes that are kept, from a real server with a real renderer, Redis and storage: what they report, store, cancel
 and refuse; the process that makes them; and the SDK and the command line with them.
 
-Not proved here: what a mesh is like (tests/worker/mesh).
+Not proved here: what a mesh is like (tests/worker/mesh), and how many may wait, which test_orbits.py proves for both.
 """
 
 from __future__ import annotations
 
 import signal
 import subprocess
-from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -26,27 +25,17 @@ from splatmill_server.background import kept, meshes
 from splatmill_worker.mesh import ply
 from tests.support.ball import PROPERTIES, write_ply
 from tests.support.command_line import invoke, spawn
-from tests.support.served_app import Serve, ServedApp, problem, store_model, stored
-from tests.support.servers.rendering import renderer_in
+from tests.support.served_app import Serve, ServedApp, problem, stored
+from tests.support.servers.rendering import KeptFiles, renderer_in, serve_in, store_only_ball
 from tests.support.waiting import wait_for
 from tests.worker.mesh.test_triangles import chunks, values
 
 pytestmark = pytest.mark.slow
 
 MODEL = "b" * 16
-MESHES = f"/v1/models/{MODEL}/meshes"
 WISH = {"faces": 2000, "voxel": 0.1}
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("meshes")
-
-
-@pytest.fixture(scope="module")
-def renderer(folder: Path) -> Iterator[subprocess.Popen[bytes]]:
-    with renderer_in(folder) as process:
-        yield process
+KEPT = KeptFiles("meshes", MODEL, WISH)
+MESHES = KEPT.path
 
 
 @pytest.fixture(autouse=True)
@@ -58,14 +47,9 @@ def _short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def app(serve: Serve, folder: Path, renderer: subprocess.Popen[bytes]) -> ServedApp:
-    running = serve(renderer_url=f"unix:{folder}/r.sock", storage=str(folder / "storage"))
-    storage = running.service.storage
-    storage.delete_prefix(layout.model(MODEL))
-    storage.delete_prefix(layout.unfinished_kept("meshes"))
-    store_model(running.service, MODEL)
-    write_ply(folder / "model.ply", 1500)
-    storage.put(layout.model_file(MODEL, "model.ply"), folder / "model.ply")
-    storage.put(layout.model_file(MODEL, "cameras.json"), around())
+    running = serve_in(serve, folder)
+    store_only_ball(running, folder, MODEL, count=1500)
+    running.service.storage.put(layout.model_file(MODEL, "cameras.json"), around())
     return running
 
 
@@ -80,30 +64,6 @@ def around() -> bytes:
         ModelCamera(name=f"{number}.jpg", split="train", camera=view) for number, view in enumerate(views)
     ]
     return ModelCameras(cameras=rows).model_dump_json().encode()
-
-
-def begun(app: ServedApp, **changed: Any) -> dict[str, Any]:
-    answer = app.http.post(MESHES, json=WISH | changed)
-    assert answer.status_code == 202, answer.text
-    found: dict[str, Any] = answer.json()
-    assert answer.headers["location"] == f"{MESHES}/{found['id']}" == found["links"]["self"]
-    return found
-
-
-def ended(app: ServedApp, mesh_id: str) -> dict[str, Any]:
-    wait_for(lambda: app.http.get(f"{MESHES}/{mesh_id}").json()["state"] in ("succeeded", "failed"), 200)
-    wait_for(lambda: marks(app) == [])
-    found: dict[str, Any] = app.http.get(f"{MESHES}/{mesh_id}").json()
-    return found
-
-
-def marks(app: ServedApp) -> list[str]:
-    return [entry.path for entry in app.service.storage.entries(layout.unfinished_kept("meshes"))]
-
-
-def files(app: ServedApp) -> list[str]:
-    folder = layout.kept_of(MODEL, "meshes") + "/"
-    return [entry.path.removeprefix(folder) for entry in app.service.storage.entries(folder)]
 
 
 def makers(renderer: subprocess.Popen[bytes]) -> list[psutil.Process]:
@@ -146,14 +106,14 @@ def test_a_mesh_is_made_in_the_background_kept_and_found_again(
         write(name, record)
 
     monkeypatch.setattr(app.service.meshes, "_write", heard)
-    made = begun(app, texture=256)
+    made = KEPT.begun(app, texture=256)
     assert (made["state"], made["request"]["faces"], made.get("facts")) == ("queued", 2000, None)
-    done = ended(app, made["id"])
+    done = KEPT.ended(app, made["id"])
     assert done["state"] == "succeeded", done
     assert [p.stage for p in said][-1] == "painting a texture"
     assert (12, 12) in {(p.done, p.total) for p in said if p.stage == "rendering depths"}
     assert done.get("progress") is None
-    assert files(app) == [f"{made['id']}/mesh", f"{made['id']}/mesh.json"]
+    assert KEPT.files(app) == [f"{made['id']}/mesh", f"{made['id']}/mesh.json"]
     file = app.http.get(done["links"]["file"])
     assert (file.status_code, file.headers["content-type"]) == (200, "model/gltf-binary")
     assert len(file.content) == done["bytes"]
@@ -172,8 +132,8 @@ def test_a_mesh_is_made_in_the_background_kept_and_found_again(
 
     again = app.http.post(MESHES, json=WISH | {"texture": 256, "format": "glb"})  # the default
     assert (again.status_code, again.json()) == (200, done)
-    cut = begun(app, format="ply", box={"min": [-2, -2, 0], "max": [1e9, 2, 2]})
-    assert ended(app, cut["id"])["state"] == "succeeded"
+    cut = KEPT.begun(app, format="ply", box={"min": [-2, -2, 0], "max": [1e9, 2, 2]})
+    assert KEPT.ended(app, cut["id"])["state"] == "succeeded"
     assert [found["id"] for found in app.http.get(MESHES).json()["meshes"]] == [cut["id"], made["id"]]
     app.service.usage.scan()
     listed = app.http.get("/v1/storage").json()["largest"]
@@ -185,28 +145,30 @@ def test_a_mesh_is_made_in_the_background_kept_and_found_again(
 
 
 def test_a_mesh_that_is_deleted_ends_its_process_and_leaves_nothing(
-    app: ServedApp, renderer: subprocess.Popen[bytes], folder: Path
+    app: ServedApp, renderer: subprocess.Popen[bytes], folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = begun(app)
+    made = KEPT.begun(app)
     caught(renderer)
     problem(app.http.get(made["links"]["file"]), 409, "mesh_not_ready")
+    monkeypatch.setattr(meshes.Meshes, "most_unfinished", 1)
+    problem(app.http.post(MESHES, json=WISH | {"faces": 500}), 409, "too_many_meshes")
     assert app.http.delete(made["links"]["self"]).status_code == 204
     wait_for(lambda: not makers(renderer), 20)
     wait_for(lambda: not app.service.meshes.unfinished.running)
     wait_for(lambda: not left(folder))
-    assert (files(app), marks(app), app.redis.keys(keys.lease("*", "*"))) == ([], [], [])
+    assert (KEPT.files(app), KEPT.marks(app), app.redis.keys(keys.lease("*", "*"))) == ([], [], [])
     problem(app.http.delete(made["links"]["self"]), 404, "mesh_not_found")
-    assert ended(app, begun(app)["id"])["state"] == "succeeded"
+    assert KEPT.ended(app, KEPT.begun(app)["id"])["state"] == "succeeded"
 
 
 def test_the_mesh_of_a_deleted_model_leaves_nothing(
     app: ServedApp, renderer: subprocess.Popen[bytes], folder: Path
 ) -> None:
-    begun(app)
+    KEPT.begun(app)
     caught(renderer)
     app.service.storage.delete_prefix(layout.model(MODEL))
     wait_for(lambda: not makers(renderer), 20)
-    wait_for(lambda: marks(app) == [])
+    wait_for(lambda: KEPT.marks(app) == [])
     assert not [path for path in stored(app) if path.startswith(layout.model(MODEL))]
     wait_for(lambda: not left(folder))
 
@@ -214,17 +176,17 @@ def test_the_mesh_of_a_deleted_model_leaves_nothing(
 def test_a_process_that_is_killed_is_a_problem_and_views_are_rendered_meanwhile(
     app: ServedApp, renderer: subprocess.Popen[bytes]
 ) -> None:
-    made = begun(app)
+    made = KEPT.begun(app)
     process = caught(renderer)
     view = CameraSpec.looking_at((4, 0, 0), (0, 0, 0), width=48, height=32).model_dump(mode="json")
     assert app.http.post(f"/v1/models/{MODEL}/render", json={"camera": view}).status_code == 200
     process.kill()
-    failed = ended(app, made["id"])
+    failed = KEPT.ended(app, made["id"])
     assert (failed["state"], failed["problem"]["code"]) == ("failed", "out_of_memory")
     assert "smaller box" in failed["problem"]["advice"]
     again = app.http.post(MESHES, json=WISH)
     assert (again.status_code, again.json()["id"], again.json()["state"]) == (202, made["id"], "queued")
-    assert ended(app, made["id"])["state"] == "succeeded"
+    assert KEPT.ended(app, made["id"])["state"] == "succeeded"
 
 
 def test_the_process_of_a_renderer_that_is_killed_ends_with_it_and_the_mesh_is_begun_again(
@@ -235,7 +197,7 @@ def test_the_process_of_a_renderer_that_is_killed_ends_with_it_and_the_mesh_is_b
     other = serve(renderer_url=f"unix:{address}", storage=str(folder / "storage"))
     monkeypatch.setattr(app.service.meshes.unfinished, "_take_up", _nothing)
     with renderer_in(tmp_path) as mine:
-        made = begun(other)
+        made = KEPT.begun(other)
         process = caught(mine)
         mine.kill()
         with suppress(psutil.Error):  # caught before it asked to end with its parent, it ends as it does
@@ -244,7 +206,7 @@ def test_the_process_of_a_renderer_that_is_killed_ends_with_it_and_the_mesh_is_b
         assert other.http.get(made["links"]["self"]).json()["state"] != "failed"
         address.unlink()
         address.symlink_to(folder / "r.sock")
-        assert ended(other, made["id"])["state"] == "succeeded"
+        assert KEPT.ended(other, made["id"])["state"] == "succeeded"
 
 
 async def _nothing() -> None:
@@ -267,7 +229,7 @@ async def _nothing() -> None:
 )
 def test_what_is_no_request_is_refused_at_once(app: ServedApp, changed: dict[str, Any], code: str) -> None:
     problem(app.http.post(MESHES, json=WISH | changed), 422, code)
-    assert marks(app) == []
+    assert KEPT.marks(app) == []
 
 
 def test_what_cannot_be_made_fails_with_the_reason(app: ServedApp, folder: Path) -> None:
@@ -275,42 +237,22 @@ def test_what_cannot_be_made_fails_with_the_reason(app: ServedApp, folder: Path)
         ({"voxel": 1e-9}, "Choose larger voxels"),
         ({"box": {"min": [5, 5, 5], "max": [6, 6, 6]}}, "agree on a surface"),
     ):
-        failed = ended(app, begun(app, **changed)["id"])
+        failed = KEPT.ended(app, KEPT.begun(app, **changed)["id"])
         assert (failed["state"], failed["problem"]["code"]) == ("failed", "option_out_of_range")
         assert said in failed["problem"]["detail"]
     storage = app.service.storage
     storage.put(layout.model_file(MODEL, "model.ply"), b"no model")
-    assert ended(app, begun(app)["id"])["problem"]["code"] == "model_corrupt"
+    assert KEPT.ended(app, KEPT.begun(app)["id"])["problem"]["code"] == "model_corrupt"
     # One Gaussian, which is a small ball, and one that nobody can see.
     write_ply(folder / "model.ply", 1)
     one = (folder / "model.ply").read_bytes()
     storage.put(layout.model_file(MODEL, "model.ply"), one)
-    assert ended(app, begun(app)["id"])["facts"]["triangles"] <= 2000
+    assert KEPT.ended(app, KEPT.begun(app)["id"])["facts"]["triangles"] <= 2000
     opacity = 4 * PROPERTIES.index("opacity")
     end = one.index(b"end_header\n") + len(b"end_header\n") + opacity
     faint = one[:end] + np.float32(-9).tobytes() + one[end + 4 :]
     storage.put(layout.model_file(MODEL, "model.ply"), faint)
-    assert "agree on a surface" in ended(app, begun(app)["id"])["problem"]["detail"]
-
-
-def test_the_number_of_meshes_is_bounded(
-    app: ServedApp, renderer: subprocess.Popen[bytes], serve: Serve, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    problem(app.http.post("/v1/models/0123456789abcdef/meshes", json=WISH), 404, "model_not_found")
-    problem(app.http.get(f"{MESHES}/0123456789abcdef"), 404, "mesh_not_found")
-    monkeypatch.setattr(meshes.Meshes, "most_unfinished", 1)
-    renderer.send_signal(signal.SIGSTOP)
-    try:
-        made = begun(app)
-        found = problem(app.http.post(MESHES, json=WISH | {"faces": 500}), 409, "too_many_meshes")
-        assert found["facts"]["limit"] == 1
-        begun(app)  # which waits already
-        assert app.http.delete(made["links"]["self"]).status_code == 204
-    finally:
-        renderer.send_signal(signal.SIGCONT)
-    wait_for(lambda: marks(app) == [])
-    without = serve(storage=app.settings.storage)
-    problem(without.http.post(MESHES, json=WISH), 503, "renderer_unavailable")
+    assert "agree on a surface" in KEPT.ended(app, KEPT.begun(app)["id"])["problem"]["detail"]
 
 
 def test_the_sdk_waits_with_progress_and_makes_nothing_twice(
@@ -359,7 +301,7 @@ def test_the_command_shows_what_is_done_and_an_interrupt_cancels_the_mesh(
     command.communicate()
     wait_for(lambda: not makers(renderer), 20)
     wait_for(lambda: not app.service.meshes.unfinished.running)
-    assert marks(app) == []
+    assert KEPT.marks(app) == []
     assert not (tmp_path / "never.glb").exists()
     refused = invoke("mesh", MODEL, "--up", "z", *server)
     assert "is for a model file" in " ".join(refused.output.replace("│", " ").split())

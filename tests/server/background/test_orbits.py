@@ -11,7 +11,6 @@ import json
 import signal
 import socket
 import subprocess
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,28 +24,17 @@ from splatmill.schema import OrbitRequest, Progress
 from splatmill.sdk.client import Client
 from splatmill_server.background import kept, orbits
 from splatmill_server.space import usage
-from tests.support.ball import write_ply
 from tests.support.command_line import invoke, spawn
-from tests.support.served_app import Serve, ServedApp, problem, store_model, stored
-from tests.support.servers.rendering import renderer_in
+from tests.support.served_app import Serve, ServedApp, problem, stored
+from tests.support.servers.rendering import KeptFiles, serve_in, store_only_ball
 from tests.support.waiting import wait_for
 
 pytestmark = pytest.mark.slow
 
 MODEL = "a" * 16
-ORBITS = f"/v1/models/{MODEL}/orbits"
 WISH = {"seconds": 1, "fps": 10, "width": 64, "height": 48}
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("orbits")
-
-
-@pytest.fixture(scope="module")
-def renderer(folder: Path) -> Iterator[subprocess.Popen[bytes]]:
-    with renderer_in(folder) as process:
-        yield process
+KEPT = KeptFiles("orbits", MODEL, WISH)
+ORBITS = KEPT.path
 
 
 @pytest.fixture(autouse=True)
@@ -58,42 +46,9 @@ def _small_parts_and_short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def app(serve: Serve, folder: Path, renderer: subprocess.Popen[bytes]) -> ServedApp:
-    running = serve(renderer_url=f"unix:{folder}/r.sock", storage=str(folder / "storage"))
-    store_ball_as(running, MODEL, folder)
+    running = serve_in(serve, folder)
+    store_only_ball(running, folder, MODEL)
     return running
-
-
-def store_ball_as(app: ServedApp, model_id: str, folder: Path) -> None:
-    storage = app.service.storage
-    storage.delete_prefix(layout.model(model_id))
-    storage.delete_prefix(layout.unfinished_kept("orbits"))
-    store_model(app.service, model_id)
-    write_ply(folder / "model.ply")
-    storage.put(layout.model_file(model_id, "model.ply"), folder / "model.ply")
-
-
-def begun(app: ServedApp, **changed: Any) -> dict[str, Any]:
-    answer = app.http.post(ORBITS, json=WISH | changed)
-    assert answer.status_code == 202, answer.text
-    found: dict[str, Any] = answer.json()
-    assert answer.headers["location"] == f"{ORBITS}/{found['id']}" == found["links"]["self"]
-    return found
-
-
-def ended(app: ServedApp, orbit_id: str) -> dict[str, Any]:
-    wait_for(lambda: app.http.get(f"{ORBITS}/{orbit_id}").json()["state"] in ("succeeded", "failed"))
-    wait_for(lambda: marks(app) == [])
-    found: dict[str, Any] = app.http.get(f"{ORBITS}/{orbit_id}").json()
-    return found
-
-
-def marks(app: ServedApp) -> list[str]:
-    return [entry.path for entry in app.service.storage.entries(layout.unfinished_kept("orbits"))]
-
-
-def files(app: ServedApp) -> list[str]:
-    folder = layout.kept_of(MODEL, "orbits") + "/"
-    return [entry.path.removeprefix(folder) for entry in app.service.storage.entries(folder)]
 
 
 def frames(video: bytes) -> list[Any]:
@@ -106,23 +61,23 @@ def test_a_video_waits_while_storage_is_listed_for_the_first_time(
 ) -> None:
     monkeypatch.setattr(kept, "_PAUSE_SECONDS", 0.3)
     monkeypatch.setattr(usage, "_FIRST_SCAN_SECONDS", 0.1)
-    app = serve(renderer_url=f"unix:{folder}/r.sock", storage=str(folder / "storage"), quota=10**9)
-    store_ball_as(app, MODEL, folder)
-    found = begun(app, width=640, height=480, seconds=4)
+    app = serve_in(serve, folder, quota=10**9)
+    store_only_ball(app, folder, MODEL)
+    found = KEPT.begun(app, width=640, height=480, seconds=4)
     # Redis loses the last scan while another process makes a new one.
     app.service.redis.set(keys.SCAN_LOCK, "another process", ex=60)
     app.service.redis.delete(keys.SCAN)
     wait_for(lambda: app.service.orbits._failures)
     app.service.redis.delete(keys.SCAN_LOCK)
-    assert ended(app, found["id"])["state"] == "succeeded"
+    assert KEPT.ended(app, found["id"])["state"] == "succeeded"
 
 
 def test_a_video_is_rendered_in_the_background_kept_and_found_again(app: ServedApp) -> None:
-    made = begun(app)
+    made = KEPT.begun(app)
     assert (made["state"], made["frames"], made["frames_done"]) == ("queued", 10, 0)
-    done = ended(app, made["id"])
+    done = KEPT.ended(app, made["id"])
     assert (done["state"], done["frames_done"], done["request"]["fps"]) == ("succeeded", 10, 10)
-    assert files(app) == [f"{made['id']}/orbit.json", f"{made['id']}/orbit.mp4"]
+    assert KEPT.files(app) == [f"{made['id']}/orbit.json", f"{made['id']}/orbit.mp4"]
     video = app.http.get(done["links"]["video"])
     assert (video.status_code, video.headers["content-type"]) == (200, "video/mp4")
     assert len(video.content) == done["bytes"]
@@ -141,9 +96,9 @@ def test_a_video_is_rendered_in_the_background_kept_and_found_again(app: ServedA
 
     again = app.http.post(ORBITS, json=WISH | {"background": "black"})  # which is the default
     assert (again.status_code, again.json()) == (200, done)
-    other = begun(app, background="white")
+    other = KEPT.begun(app, background="white")
     assert other["id"] != made["id"]
-    ended(app, other["id"])
+    KEPT.ended(app, other["id"])
     listed = app.http.get(ORBITS).json()["orbits"]
     assert [found["id"] for found in listed] == [other["id"], made["id"]]
     # It counts as what the owner has in storage, and goes with the model.
@@ -168,7 +123,7 @@ def test_a_video_that_is_deleted_is_not_rendered_any_further(
 ) -> None:
     renderer.send_signal(signal.SIGSTOP)
     try:
-        made = begun(app)
+        made = KEPT.begun(app)
         wait_for(lambda: bool(app.service.orbits.unfinished._working))
         found = problem(app.http.get(made["links"]["video"]), 409, "orbit_not_ready")
         assert found["facts"]["frames"] == 10
@@ -176,10 +131,10 @@ def test_a_video_that_is_deleted_is_not_rendered_any_further(
         wait_for(lambda: not app.service.orbits.unfinished.running)
     finally:
         renderer.send_signal(signal.SIGCONT)
-    assert (files(app), marks(app), app.redis.keys(keys.lease("*", "*"))) == ([], [], [])
+    assert (KEPT.files(app), KEPT.marks(app), app.redis.keys(keys.lease("*", "*"))) == ([], [], [])
     problem(app.http.delete(f"{ORBITS}/{made['id']}"), 404, "orbit_not_found")
     # The renderer is free for others, and the same video can be asked for again.
-    assert ended(app, begun(app)["id"])["state"] == "succeeded"
+    assert KEPT.ended(app, KEPT.begun(app)["id"])["state"] == "succeeded"
 
 
 def test_a_video_goes_on_where_an_api_that_was_stopped_left_it(
@@ -199,13 +154,13 @@ def test_a_video_goes_on_where_an_api_that_was_stopped_left_it(
         return await next_part(self, name, found)
 
     monkeypatch.setattr(orbits.Orbits, "_next", killed_after_four_frames)
-    made = begun(app)
+    made = KEPT.begun(app)
     wait_for(lambda: asked == [0, 4])
     wait_for(lambda: not app.service.orbits.unfinished.running)
     between = app.http.get(f"{ORBITS}/{made['id']}").json()
     assert (between["state"], between["frames_done"]) == ("running", 4)
-    second = serve(renderer_url=f"unix:{folder}/r.sock", storage=str(folder / "storage"))
-    done = ended(second, made["id"])
+    second = serve_in(serve, folder)
+    done = KEPT.ended(second, made["id"])
     assert (done["state"], asked) == ("succeeded", [0, 4, 4, 8, 10])
     assert len(frames(second.http.get(done["links"]["video"]).content)) == 10
 
@@ -219,7 +174,7 @@ def test_a_renderer_that_is_away_is_waited_for_and_one_that_dies_is_asked_again(
 ) -> None:
     address = tmp_path / "r.sock"
     app = serve(renderer_url=f"unix:{address}", storage=str(folder / "storage"))
-    store_ball_as(app, MODEL, folder)
+    store_only_ball(app, folder, MODEL)
     counted: list[bool] = []
     ask = app.service.orbits._ask
 
@@ -231,7 +186,7 @@ def test_a_renderer_that_is_away_is_waited_for_and_one_that_dies_is_asked_again(
             raise
 
     monkeypatch.setattr(app.service.orbits, "_ask", heard)
-    made = begun(app)
+    made = KEPT.begun(app)
     wait_for(lambda: len(counted) > kept.MAX_ATTEMPTS)
     assert not any(counted), "a renderer that cannot be reached has tried nothing"
     assert app.http.get(f"{ORBITS}/{made['id']}").json()["state"] == "queued"
@@ -244,14 +199,14 @@ def test_a_renderer_that_is_away_is_waited_for_and_one_that_dies_is_asked_again(
         wait_for(lambda: any(counted))
     address.unlink()
     address.symlink_to(folder / "r.sock")
-    assert ended(app, made["id"])["state"] == "succeeded"
+    assert KEPT.ended(app, made["id"])["state"] == "succeeded"
 
 
 def test_a_video_that_cannot_be_rendered_has_failed_with_the_reason(app: ServedApp) -> None:
     storage = app.service.storage
     storage.put(layout.model_file(MODEL, "model.ply"), b"no model")
-    made = begun(app)
-    failed = ended(app, made["id"])
+    made = KEPT.begun(app)
+    failed = KEPT.ended(app, made["id"])
     assert (failed["state"], failed["problem"]["code"]) == ("failed", "model_corrupt")
     refusal = problem(app.http.get(made["links"]["video"]), 409, "orbit_not_ready")
     assert "problem" in refusal["advice"]
@@ -259,7 +214,7 @@ def test_a_video_that_cannot_be_rendered_has_failed_with_the_reason(app: ServedA
     again = app.http.post(ORBITS, json=WISH)
     assert (again.status_code, again.json()["id"], again.json()["state"]) == (202, made["id"], "queued")
     assert again.json().get("problem") is None
-    assert ended(app, made["id"])["state"] == "failed"
+    assert KEPT.ended(app, made["id"])["state"] == "failed"
 
 
 def test_the_video_of_a_deleted_model_leaves_nothing(
@@ -267,12 +222,12 @@ def test_the_video_of_a_deleted_model_leaves_nothing(
 ) -> None:
     renderer.send_signal(signal.SIGSTOP)
     try:
-        begun(app)
+        KEPT.begun(app)
         wait_for(lambda: bool(app.service.orbits.unfinished._working))
         app.service.storage.delete_prefix(layout.model(MODEL))
     finally:
         renderer.send_signal(signal.SIGCONT)
-    wait_for(lambda: marks(app) == [])
+    wait_for(lambda: KEPT.marks(app) == [])
     assert not [path for path in stored(app) if path.startswith(layout.model(MODEL))]
 
 
@@ -290,16 +245,16 @@ def test_what_is_refused_is_refused_before_it_waits(
     monkeypatch.setattr(orbits.Orbits, "most_of_model", 2)
     renderer.send_signal(signal.SIGSTOP)
     try:
-        two = [begun(app)["id"], begun(app, fps=11)["id"]]
+        two = [KEPT.begun(app)["id"], KEPT.begun(app, fps=11)["id"]]
         found = problem(app.http.post(ORBITS, json=WISH | {"fps": 12}), 409, "too_many_orbits")
         assert found["facts"]["limit"] == 2
         assert "owner" in found["detail"]
-        begun(app)  # which waits already
+        KEPT.begun(app)  # which waits already
         assert len(app.service.orbits.unfinished.running) <= 1, "videos of an owner are rendered one by one"
     finally:
         renderer.send_signal(signal.SIGCONT)
     for orbit_id in two:
-        ended(app, orbit_id)
+        KEPT.ended(app, orbit_id)
     found = problem(app.http.post(ORBITS, json=WISH | {"fps": 12}), 409, "too_many_orbits")
     assert MODEL in found["detail"]
     without = serve(storage=app.settings.storage)
@@ -307,7 +262,7 @@ def test_what_is_refused_is_refused_before_it_waits(
 
 
 def test_a_broken_record_hides_no_other(app: ServedApp) -> None:
-    made = ended(app, begun(app)["id"])
+    made = KEPT.ended(app, KEPT.begun(app)["id"])
     broken = {"id": "0" * 16, "model": MODEL, "state": "later"}
     app.service.storage.put(layout.kept_record(MODEL, "orbits", "0" * 16), json.dumps(broken).encode())
     assert [found["id"] for found in app.http.get(ORBITS).json()["orbits"]] == [made["id"]]
@@ -369,7 +324,7 @@ def test_the_command_shows_progress_and_an_interrupt_cancels_the_video(
         wait_for(lambda: not app.service.orbits.unfinished.running)
     finally:
         renderer.send_signal(signal.SIGCONT)
-    assert marks(app) == []
+    assert KEPT.marks(app) == []
     assert not (tmp_path / "never.mp4").exists()
 
 
@@ -383,7 +338,7 @@ def test_a_video_has_failed_after_an_error_that_nobody_expected(
         raise RecursionError
 
     monkeypatch.setattr(kept, "post", broken)
-    made = begun(app)
+    made = KEPT.begun(app)
     wait_for(lambda: app.http.get(made["links"]["self"]).json()["state"] == "failed")
     assert "RecursionError" in app.http.get(made["links"]["self"]).json()["problem"]["detail"]
     assert not list(app.service.storage.entries(layout.unfinished_kept("orbits")))

@@ -9,7 +9,6 @@ import ipaddress
 import socket
 import ssl
 import subprocess
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,13 +24,7 @@ from splatmill_server.base.outgoing import (
     refusal,
 )
 from tests.support.programs import program
-from tests.support.servers.scripted_server import Reply, ScriptedServer, scripted_server
-
-
-@pytest.fixture
-def peer() -> Iterator[ScriptedServer]:
-    with scripted_server() as server:
-        yield server
+from tests.support.servers.scripted_server import Reply, ScriptedServer
 
 
 def port_of(peer: ScriptedServer) -> int:

@@ -340,7 +340,8 @@ def test_a_capture_that_is_deleted_meanwhile_keeps_nothing(app: ServedApp) -> No
     assert list(app.service.storage.entries(layout.capture(capture_id))) == []
 
 
-def test_requests_that_are_not_understood_are_named(app: ServedApp) -> None:
+def test_requests_that_are_not_understood_are_named(serve: Serve) -> None:
+    app = serve()
     capture_id = capture(app)
     address = begin(app, capture_id).headers["location"]
     wrong_type = append(app, address, 0, b"x", headers={"Content-Type": "application/octet-stream"})
@@ -356,7 +357,8 @@ def test_requests_that_are_not_understood_are_named(app: ServedApp) -> None:
     problem(app.http.options(f"/v1/captures/{capture_id}/images/a.mp4"), 404, "capture_not_found")
 
 
-def test_a_taken_name_is_refused_before_a_byte_is_sent(app: ServedApp) -> None:
+def test_a_taken_name_is_refused_before_a_byte_is_sent(serve: Serve) -> None:
+    app = serve()
     capture_id = capture(app)
     assert app.http.put(f"/v1/captures/{capture_id}/images/a.mp4", content=b"there").status_code == 201
     refused = problem(begin(app, capture_id), 409, "name_taken")

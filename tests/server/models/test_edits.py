@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -20,10 +19,9 @@ from splatmill.cli.exits import Exit
 from splatmill.errors import InvalidRequest, NotFound
 from splatmill.schema import CameraSpec
 from splatmill_worker.splat.formats import ply
-from tests.support.ball import write_ply
 from tests.support.command_line import invoke
-from tests.support.served_app import Serve, ServedApp, store_model
-from tests.support.servers.rendering import hold_out, renderer_in
+from tests.support.served_app import Serve, ServedApp
+from tests.support.servers.rendering import hold_out, serve_in, store_only_ball
 from tests.support.waiting import wait_for
 
 pytestmark = pytest.mark.slow
@@ -34,20 +32,10 @@ RIGHT = {"min": [0, -2, -2], "max": [2, 2, 2]}
 """The red half of the ball."""
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    path = tmp_path_factory.mktemp("edits")
-    with renderer_in(path):
-        yield path
-
-
 @pytest.fixture
-def app(serve: Serve, folder: Path) -> ServedApp:
-    running = serve(renderer_url=f"unix:{folder}/r.sock", storage=str(folder / "storage"))
-    running.service.storage.delete_prefix("models")
-    store_model(running.service, MODEL, "ball")
-    write_ply(folder / "model.ply")
-    running.service.storage.put(layout.model_file(MODEL, "model.ply"), folder / "model.ply")
+def app(serve: Serve, folder: Path, renderer: object) -> ServedApp:
+    running = serve_in(serve, folder)
+    store_only_ball(running, folder, MODEL, "ball")
     return running
 
 

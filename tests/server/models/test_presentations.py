@@ -9,7 +9,6 @@ from __future__ import annotations
 import io
 import json
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +19,8 @@ from splatmill import Client
 from splatmill.backplane.storage import layout
 from splatmill.errors import InvalidRequest, ServerError
 from splatmill.schema import CameraSpec, Presentation
-from tests.support.ball import write_ply
-from tests.support.served_app import Serve, ServedApp, problem, store_model
-from tests.support.servers.rendering import hold_out, renderer_in
+from tests.support.served_app import Serve, ServedApp, problem
+from tests.support.servers.rendering import hold_out, serve_in, store_only_ball
 
 pytestmark = pytest.mark.slow
 
@@ -33,25 +31,11 @@ BEHIND = CameraSpec.looking_at((-4, 0, 0), (0, 0, 0), width=2000, height=1000)
 LENGTH = {"points": [[0, 0, 0], [1, 0, 0]], "name": "the lid"}
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    path = tmp_path_factory.mktemp("presentations")
-    with renderer_in(path):
-        yield path
-
-
 @pytest.fixture
-def app(serve: Serve, folder: Path) -> ServedApp:
-    running = serve(renderer_url=f"unix:{folder}/r.sock", storage=str(folder / "storage"))
-    store_ball(running, folder)
+def app(serve: Serve, folder: Path, renderer: object) -> ServedApp:
+    running = serve_in(serve, folder)
+    store_only_ball(running, folder, MODEL, "ball")
     return running
-
-
-def store_ball(app: ServedApp, folder: Path) -> None:
-    app.service.storage.delete_prefix("models")
-    store_model(app.service, MODEL, "ball")
-    write_ply(folder / "model.ply")
-    app.service.storage.put(layout.model_file(MODEL, "model.ply"), folder / "model.ply")
 
 
 def picture(app: ServedApp, address: str) -> Image.Image:
@@ -138,7 +122,7 @@ def test_the_page_in_one_file_shows_the_same(app: ServedApp) -> None:
 
 def test_nothing_changes_where_the_picture_cannot_be_made(serve: Serve, folder: Path) -> None:
     app = serve(storage=str(folder / "storage"))
-    store_ball(app, folder)
+    store_only_ball(app, folder, MODEL, "ball")
     app.http.patch(PRESENTATION, json={"auto_rotate": True})
     wish = {"start_view": VIEW.model_dump(mode="json", exclude_none=True), "auto_rotate": False}
     problem(app.http.patch(PRESENTATION, json=wish), 503, "renderer_unavailable")

@@ -14,6 +14,7 @@ from splatmill.backplane import keys
 from splatmill.backplane.jobs import events
 from splatmill.schema import JobState, LogEvent, MetricEvent, PlanEvent, Problem, ProgressEvent, StateEvent
 from splatmill_server.jobs.shrinking import shrink
+from tests.support.jobs import read_progress
 from tests.support.served_app import Serve, ServedApp, problem
 from tests.support.servers.server_events import brief, follow, messages
 
@@ -154,7 +155,7 @@ def test_the_progress_stream_is_trimmed_and_the_states_are_not(app: ServedApp) -
     assert length is not None
     for n in range(length + 500):
         app.say(job_id, ProgressEvent(stage="training", done=n), StateEvent(state=JobState.training))
-    left = events.read_progress(app.redis, job_id)
+    left = read_progress(app.redis, job_id)
     assert length <= len(left) < length + 200
     assert len(events.read_states(app.redis, job_id)) == length + 501
     latest = events.last_progress(app.redis, job_id)

@@ -6,7 +6,7 @@ Not proved here: what a worker stores (tests/worker/service/test_room.py).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -21,9 +21,8 @@ from splatmill.backplane.storage.storage import Entry
 from splatmill.schema import DOWNLOADS, CameraSpec, StoredKind
 from splatmill_server.space.quota import JOB_ROOM
 from tests.server.space.conftest import Clock, Person, ServePeople
-from tests.support.ball import write_ply
-from tests.support.served_app import ServedApp, problem, store_model
-from tests.support.servers.rendering import hold_out, renderer_in
+from tests.support.served_app import ServedApp, problem
+from tests.support.servers.rendering import hold_out, serve_in, store_only_ball
 from tests.support.waiting import wait_for
 
 pytestmark = pytest.mark.slow
@@ -32,22 +31,11 @@ MODEL = "b" * 16
 WISH = {"seconds": 1, "fps": 10, "width": 96, "height": 64}
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    path = tmp_path_factory.mktemp("room")
-    with renderer_in(path):
-        yield path
-
-
 @pytest.fixture
-def app(serve_people: ServePeople, folder: Path) -> ServedApp:
+def app(serve_people: ServePeople, folder: Path, renderer: object) -> ServedApp:
     """A server whose owner `default` has one model of 400 Gaussians."""
-    running = serve_people(renderer_url=f"unix:{folder}/r.sock", storage=str(folder / "storage"))
-    for prefix in ("models", "captures", "jobs", "orbits", "shares"):
-        running.service.storage.delete_prefix(prefix)
-    store_model(running.service, MODEL, "ball")
-    write_ply(folder / "model.ply")
-    running.service.storage.put(layout.model_file(MODEL, "model.ply"), folder / "model.ply")
+    running = serve_in(serve_people, folder)
+    store_only_ball(running, folder, MODEL, "ball")
     view = CameraSpec.looking_at((4, 0, 0), (0, 0, 0), width=96, height=64)
     hold_out(running, MODEL, [view])
     return running

@@ -26,6 +26,12 @@ THEMES = ("light", "dark")
 LONG = 300_000
 """Milliseconds for a job, and for pictures that are drawn in software beside it."""
 
+DRAWN = """() => {
+  const view = document.querySelector(".view");
+  return view?.dataset.frames > 0 && !view.querySelector("img") && !view.querySelector(".said").textContent;
+}"""
+"""Whether the view shows the model, and neither its picture nor that it is being loaded."""
+
 
 class Walk:
     """One walk: a window of one size and theme, and where its pictures go."""
@@ -68,11 +74,7 @@ class Walk:
     def show(self, address: str) -> None:
         """Open a page with a view, and wait until it has drawn."""
         self.page.goto(address)
-        self.page.wait_for_function(
-            "() => { const view = document.querySelector('.view'); return view?.dataset.frames > 0 "
-            "&& !view.querySelector('img') && !view.querySelector('.said').textContent; }",
-            polling=500,
-        )
+        self.page.wait_for_function(DRAWN, polling=500)
 
     def use(self, model: str, other: str, link: str) -> None:
         """Everything that people do with a model that is finished."""

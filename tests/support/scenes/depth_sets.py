@@ -13,6 +13,7 @@ from PIL import Image
 
 from splatmill_worker.scene import Camera, Float
 from splatmill_worker.synthetic import orbit, photograph, still_life
+from tests.support import posed_sets
 
 DEPTH_SIZE = 96, 72
 """Pixels of a depth map, across and down."""
@@ -42,17 +43,6 @@ def measured(camera: Camera, seed: int) -> tuple[npt.NDArray[np.uint16], npt.NDA
     return np.where(depth < REACH, 1000.0 * noisy, 0.0).round().astype(np.uint16), confidence
 
 
-def poses(cameras: dict[str, Camera]) -> list[dict[str, Any]]:
-    """The frames of a transforms file."""
-    frames = []
-    for name, camera in cameras.items():
-        matrix = np.eye(4)
-        matrix[:3, :3] = camera.viewmat[:3, :3].T @ np.diag([1.0, -1.0, -1.0])
-        matrix[:3, 3] = camera.center
-        frames.append({"file_path": f"images/{name}", "transform_matrix": matrix.tolist()})
-    return frames
-
-
 def data_set(
     folder: Path,
     count: int = 14,
@@ -75,20 +65,11 @@ def data_set(
         levels, confidence = measured(camera, k)
         Image.fromarray(change(levels)).save(folder / "depth" / name)
         Image.fromarray(confidence).save(folder / "confidence" / name)
-    camera = next(iter(cameras.values()))
-    frames = poses(cameras)
+    whole = posed_sets.document(cameras) | (document or {})
     if named:
-        frames = [frame | {"depth_file_path": f"depth/{Path(frame['file_path']).name}"} for frame in frames]
-    lens = {
-        "w": size[0],
-        "h": size[1],
-        "fl_x": camera.fx,
-        "fl_y": camera.fy,
-        "cx": camera.cx,
-        "cy": camera.cy,
-    }
-    text = json.dumps({**lens, **(document or {}), "frames": frames})
-    (folder / "transforms.json").write_text(text)
+        for frame in whole["frames"]:
+            frame["depth_file_path"] = f"depth/{Path(frame['file_path']).name}"
+    (folder / "transforms.json").write_text(json.dumps(whole))
     return cameras
 
 

@@ -5,6 +5,8 @@ from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
+import pytest
+
 from splatmill.sdk.loop import BackgroundLoop
 
 
@@ -108,3 +110,10 @@ def scripted_server() -> Iterator[ScriptedServer]:
     yield peer
     loop.run(stop(server))
     loop.close()
+
+
+@pytest.fixture
+def peer() -> Iterator[ScriptedServer]:
+    """A scripted server for one test; a conftest.py that imports it offers it."""
+    with scripted_server() as server:
+        yield server

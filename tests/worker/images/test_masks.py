@@ -3,7 +3,6 @@
 Does not prove that hidden pixels stay out of the training; the tests of loading photos do.
 """
 
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -19,6 +18,7 @@ from splatmill_worker.images.overlays import overlays
 from splatmill_worker.images.prepare import Prepared, prepare
 from splatmill_worker.sfm import features, posed
 from splatmill_worker.sfm.features import FeatureStore
+from tests.support.posed_sets import frames, transforms
 
 SIZE = (64, 48)
 
@@ -119,13 +119,10 @@ def _drawn(low: int, high: int, mode: str = "L", first_hidden: bool = False) -> 
 
 def _labelled(folder: Path, mask_of: Callable[[int], Image.Image], suffix: str = "png") -> None:
     (folder / "masks").mkdir()
-    frames = []
     for number in range(3):
         photo(folder / f"images/{number}.jpg", number)
         mask_of(number).save(folder / f"masks/{number}.{suffix}")
-        frames.append({"file_path": f"images/{number}.jpg", "transform_matrix": np.eye(4).tolist()})
-    document = {"fl_x": 60.0, "w": SIZE[0], "h": SIZE[1], "frames": frames}
-    (folder / "transforms.json").write_text(json.dumps(document))
+    transforms(folder / "transforms.json", frames(["0.jpg", "1.jpg", "2.jpg"]))
 
 
 @pytest.mark.parametrize(
@@ -196,14 +193,11 @@ def test_a_mask_without_its_photo_is_named(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("place", ["masks/{}.PNG", "Mask/{}.png", "images/{}_mask.png", "images/mask_{}.png"])
 def test_masks_of_photos_with_cameras(tmp_path: Path, place: str) -> None:
-    frames = []
     for number in range(3):
         photo(tmp_path / f"images/{number}.jpg", number)
         mask(tmp_path / place.format(number), 0.875)
-        frames.append({"file_path": f"images/{number}.jpg", "transform_matrix": np.eye(4).tolist()})
     mask(tmp_path / "masks/other.png", 0.25)
-    document = {"fl_x": 60.0, "w": SIZE[0], "h": SIZE[1], "frames": frames}
-    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    transforms(tmp_path / "transforms.json", frames(["0.jpg", "1.jpg", "2.jpg"]))
     given = posed.find(tmp_path)
     assert given is not None
     scene = given.load()
@@ -238,14 +232,11 @@ def test_a_failure_names_what_is_wrong_with_the_masks(tmp_path: Path) -> None:
 def test_pictures_in_the_folder_of_masks_are_refused_as_previews_of_masks(
     tmp_path: Path, posed_too: bool
 ) -> None:
-    frames = []
-    for number in range(4):
-        photo(tmp_path / f"images/{number}.png", number)
-        photo(tmp_path / f"masks/{number}.png", number + 10)
-        matrix = np.eye(4)
-        matrix[0, 3] = number
-        frames.append({"file_path": f"images/{number}.png", "transform_matrix": matrix.tolist()})
-    (tmp_path / "transforms.json").write_text(json.dumps({"camera_angle_x": 1.0, "frames": frames}))
+    names = [f"{number}.png" for number in range(4)]
+    for number, name in enumerate(names):
+        photo(tmp_path / "images" / name, number)
+        photo(tmp_path / "masks" / name, number + 10)
+    transforms(tmp_path / "transforms.json", frames(names))
     given = posed.find(tmp_path)
     assert given is not None
     with pytest.raises(Refusal) as refused:

@@ -24,12 +24,12 @@ from splatmill.schema import TrainOptions
 from splatmill_worker import pipeline
 from splatmill_worker.images.lens import PANORAMA, pinhole
 from splatmill_worker.images.panoramas import faces
-from splatmill_worker.scene import Camera, Float, Lens, View
-from splatmill_worker.sfm.posed.transforms import OPENGL_TO_OPENCV
+from splatmill_worker.scene import Camera, Lens, View
 from splatmill_worker.splat.formats import registry
 from splatmill_worker.splat.render import render
 from splatmill_worker.synthetic.ray_caster import photograph
 from tests.support import panoramas
+from tests.support.posed_sets import frame_of
 
 pytestmark = pytest.mark.slow
 
@@ -40,11 +40,6 @@ FISHEYE = 200.0
 COLORS = ("red", "green", "blue")
 HELD_OUT = (0, 8)
 """Panoramas of ten in order that a training holds out."""
-
-
-def frame(name: str, viewmat: Float, **intrinsics: Any) -> dict[str, Any]:
-    matrix = np.linalg.inv(viewmat) @ OPENGL_TO_OPENCV
-    return {"file_path": f"images/{name}", "transform_matrix": matrix.tolist(), **intrinsics}
 
 
 def trained(capture: Path, frames: list[dict[str, Any]], **lists: Any) -> Path:
@@ -149,7 +144,7 @@ def test_photos_of_all_directions_train_as_well_as_pinhole_photos_of_the_same(
             shown = shown_by(view, face, degrees)
             Image.fromarray(shown.astype(np.uint8) * 255).save(of_pinholes / "masks" / file)
             size = {"w": width, "h": height, "fl_x": face.camera.fx, "fl_y": face.camera.fy}
-            frames.append(frame(file, face.camera.viewmat, **size, cx=face.camera.cx, cy=face.camera.cy))
+            frames.append(frame_of(file, face.camera.viewmat, **size, cx=face.camera.cx, cy=face.camera.cy))
             row, column = np.mgrid[2:height:6, 2:width:6].reshape(2, -1)
             row, column = row[shown[row, column]], column[shown[row, column]]
             place = face.camera.unproject(column + 0.5, row + 0.5, depths[row, column])
@@ -165,7 +160,7 @@ def test_photos_of_all_directions_train_as_well_as_pinhole_photos_of_the_same(
         (capture / "points.ply").write_text("\n".join([*header, *points, ""]))
     trained_on = [each["file_path"] for each in frames if each["file_path"] not in test_names]
     pinholes = trained(of_pinholes, frames, train_filenames=trained_on, test_filenames=test_names)
-    given = [frame(view.name, view.camera.viewmat, **intrinsics(view)) for view in views]
+    given = [frame_of(view.name, view.camera.viewmat, **intrinsics(view)) for view in views]
     spheres = trained(of_photos, given)
     ours, theirs = psnr(spheres, held_out), psnr(pinholes, held_out)
     assert ours > theirs - 1.0

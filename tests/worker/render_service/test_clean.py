@@ -25,6 +25,7 @@ from splatmill_worker.splat.formats import ply
 from splatmill_worker.splat.gaussians import Gaussians, concatenate
 from splatmill_worker.splat.render import render
 from tests.support.gaussians import some_gaussians
+from tests.support.posed_sets import document
 
 OWN, PLANTED = 300, 5
 SPECS = [
@@ -59,18 +60,13 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Spoilt:
     ply.write(folder / "model.ply", concatenate(own, floaters))
     images = folder / "capture" / "images"
     images.mkdir(parents=True)
-    frames, cameras = [], []
-    for index, spec in enumerate(SPECS):
-        camera = camera_of(spec)
-        shown = render(own, camera).color.clamp(0, 1).numpy() * 255
-        Image.fromarray(shown.round().astype(np.uint8)).save(images / f"{index}.png")
-        pose = np.eye(4)
-        pose[:3, :3] = camera.viewmat[:3, :3].T @ np.diag([1.0, -1.0, -1.0])
-        pose[:3, 3] = camera.center
-        frames.append({"file_path": f"images/{index}.png", "transform_matrix": pose.tolist()})
-        cameras.append(ModelCamera(name=f"{index}.png", split="test" if index == 4 else "train", camera=spec))
-    lens = {"w": 64, "h": 48, "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
-    (folder / "capture" / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
+    views = {f"{index}.png": camera_of(spec) for index, spec in enumerate(SPECS)}
+    cameras = []
+    for index, (name, view) in enumerate(views.items()):
+        shown = render(own, view).color.clamp(0, 1).numpy() * 255
+        Image.fromarray(shown.round().astype(np.uint8)).save(images / name)
+        cameras.append(ModelCamera(name=name, split="test" if index == 4 else "train", camera=SPECS[index]))
+    (folder / "capture" / "transforms.json").write_text(json.dumps(document(views)))
     (folder / "cameras.json").write_text(ModelCameras(cameras=cameras).model_dump_json(exclude_none=True))
     return Spoilt(folder / "model.ply", folder / "capture")
 

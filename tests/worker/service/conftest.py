@@ -16,6 +16,13 @@ from tests.support.files.other_file_system import other_file_system as other_fil
 from tests.support.jobs import CAPTURE
 from tests.support.redis_server import connection as connection
 from tests.support.redis_server import redis_server as redis_server
+from tests.support.up import scripted
+
+
+@pytest.fixture
+def storage(tmp_path: Path) -> Storage:
+    """Storage with a capture that the stand-in trains in three steps, and a diary of its attempts."""
+    return scripted(tmp_path, steps=3)
 
 
 @pytest.fixture

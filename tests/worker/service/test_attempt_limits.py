@@ -25,7 +25,7 @@ from splatmill_worker.service import attempt_limits, command
 from splatmill_worker.service.attempt_limits import Limits
 from tests.support.jobs import messages, read_job, write_row
 from tests.support.redis_server import RedisServer
-from tests.support.up import STANDIN
+from tests.support.up import running_worker, worker_environment
 from tests.support.waiting import gone, wait_for
 
 MIB = 2**20
@@ -34,16 +34,9 @@ MIB = 2**20
 @contextlib.contextmanager
 def worker(server: RedisServer, storage: Storage, folder: Path, **settings: str) -> Iterator[int]:
     """A worker with these settings, which gives an attempt one second to save its state; yields its process id."""
-    environment = dict(os.environ) | STANDIN | settings
-    environment |= {"REDIS_URL": server.url, "SPLATMILL_STORAGE": storage.url, "SPLATMILL_DATA": str(folder)}
-    program = [sys.executable, "-m", "splatmill_worker", "train", "--stop-grace", "1"]
-    process = subprocess.Popen(program, env=environment)
-    try:
+    environment = worker_environment(server, storage, folder, **settings)
+    with running_worker(environment, "--stop-grace", "1") as process:
         yield process.pid
-        assert process.poll() is None
-    finally:
-        process.terminate()
-        process.wait(30)
 
 
 def submit(connection: redis.Redis, storage: Storage, folder: Path, job_id: str, **script: object) -> None:
@@ -62,11 +55,6 @@ def ended(connection: redis.Redis, job_id: str) -> Job | None:
 def attempts(folder: Path, job_id: str) -> list[int]:
     """The processes of the attempts at a job."""
     return [json.loads(line)["pid"] for line in (folder / f"{job_id}.diary").read_text().splitlines()]
-
-
-@pytest.fixture
-def storage(tmp_path: Path) -> Storage:
-    return Storage((tmp_path / "storage").as_uri())
 
 
 @pytest.mark.slow
@@ -102,7 +90,7 @@ def test_an_attempt_that_runs_too_long_saves_its_state_and_fails_once(
     assert job.problem.facts == {"limit_seconds": 2.0}
     assert "checkpoint" in str(job.problem.advice)
     assert any(line.startswith("saved at step") for line in messages(connection, "patient1"))
-    assert (tmp_path / "work/patient1/run/checkpoints/state.json").is_file()
+    assert (tmp_path / "data/work/patient1/run/checkpoints/state.json").is_file()
 
 
 @pytest.mark.slow

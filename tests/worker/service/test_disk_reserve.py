@@ -14,15 +14,13 @@ from rq import Worker
 
 from splatmill.backplane import keys
 from splatmill.backplane.queue import entries, queue
-from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.storage import Storage
-from splatmill.schema import Role
 from splatmill_worker.errors import DiskReserveReached
 from splatmill_worker.service import disk_reserve
 from splatmill_worker.service.job_folder import JobFolder
 from tests.support.jobs import CAPTURE, read_job, write_row
 from tests.support.redis_server import RedisServer
-from tests.support.up import STANDIN
+from tests.support.up import scripted, worker_environment
 from tests.support.waiting import wait_for
 
 JOB = "job00001"
@@ -80,11 +78,8 @@ def test_an_attempt_stops_at_the_reserve_and_a_restart_goes_on(
     redis_server: RedisServer, tmp_path: Path
 ) -> None:
     connection = redis_server.connection
-    storage = Storage((tmp_path / "storage").as_uri())
-    script = {"steps": 60, "pause": 0.05, "diary": str(tmp_path / "diary")}
-    storage.put(layout.capture_file(CAPTURE, Role.images, "script.json"), json.dumps(script).encode())
-    environment = os.environ | STANDIN
-    environment |= {"SPLATMILL_STORAGE": storage.url, "SPLATMILL_DATA": str(tmp_path / "data")}
+    storage = scripted(tmp_path, steps=60, pause=0.05)
+    environment = worker_environment(redis_server, storage, tmp_path)
     checkpoint = tmp_path / "data" / "work" / JOB / "run" / "checkpoints" / "state.json"
 
     def attempt(generation: int, full_at: int) -> None:
@@ -109,20 +104,12 @@ def test_an_attempt_stops_at_the_reserve_and_a_restart_goes_on(
 
 @pytest.mark.slow
 def test_a_worker_takes_no_jobs_while_its_disk_is_full_and_says_so(
-    redis_server: RedisServer, tmp_path: Path
+    redis_server: RedisServer, storage: Storage, tmp_path: Path
 ) -> None:
     connection = redis_server.connection
     write_row(connection, JOB)
     queue.enqueue(connection, JOB, 1)
-    environment = (
-        os.environ
-        | STANDIN
-        | {
-            "REDIS_URL": redis_server.url,
-            "SPLATMILL_DATA": str(tmp_path / "data"),
-            "SPLATMILL_DISK_RESERVE": "1000000TB",
-        }
-    )
+    environment = worker_environment(redis_server, storage, tmp_path, SPLATMILL_DISK_RESERVE="1000000TB")
     command = [sys.executable, "-m", "splatmill_worker", "train"]
     with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True) as worker:
         wait_for(

@@ -3,13 +3,10 @@
 Does not prove what happens while Redis is away: tests/worker/service/attempts/test_outbox.py and tests/service do.
 """
 
-import contextlib
 import json
 import os
-import subprocess
-import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,16 +17,14 @@ from splatmill.backplane.connection import connect
 from splatmill.backplane.jobs import events
 from splatmill.backplane.queue import leases, queue, rq_keys
 from splatmill.backplane.refusal import RedisRefuses
-from splatmill.backplane.storage import layout
-from splatmill.backplane.storage.storage import Storage
-from splatmill.schema import JobState, LogEvent, Role, StateEvent
+from splatmill.schema import JobState, LogEvent, StateEvent
 from splatmill_worker.service.attempts.attempt import Attempt
 from splatmill_worker.service.attempts.outbox import Outbox
 from splatmill_worker.service.lock import JobLock
-from tests.support.jobs import CAPTURE, messages, read_job, write_row
+from tests.support.jobs import messages, read_job, write_row
 from tests.support.redis_server import RedisServer
 from tests.support.servers.queue_entries import take
-from tests.support.up import STANDIN
+from tests.support.up import running_worker, scripted, worker_environment
 from tests.support.waiting import wait_for
 
 JOB = "job00001"
@@ -123,40 +118,6 @@ def test_nothing_is_requeued_while_heartbeats_are_refused_nor_right_after(
     assert leases.prolong(connection, lease)
 
 
-@contextlib.contextmanager
-def worker(server: RedisServer, storage: Storage, folder: Path, **more: str) -> Iterator[None]:
-    environment = (
-        os.environ
-        | STANDIN
-        | {
-            "REDIS_URL": server.url,
-            "SPLATMILL_STORAGE": storage.url,
-            "SPLATMILL_DATA": str(folder / "data"),
-        }
-    )
-    command = [sys.executable, "-m", "splatmill_worker", "train"]
-    process = subprocess.Popen(command, env=environment | more)
-    try:
-        yield
-        assert process.poll() is None
-    finally:
-        process.terminate()
-        process.wait(30)
-
-
-@pytest.fixture
-def scripted(tmp_path: Path) -> Callable[..., Storage]:
-    """Makes storage with a capture that the stand-in trains as a script says."""
-
-    def make(**script: Any) -> Storage:
-        storage = Storage((tmp_path / "storage").as_uri())
-        text = json.dumps({"pause": 0.05, "diary": str(tmp_path / "diary")} | script)
-        storage.put(layout.capture_file(CAPTURE, Role.images, "script.json"), text.encode())
-        return storage
-
-    return make
-
-
 def attempts(folder: Path) -> list[Any]:
     diary = folder / "diary"
     return [json.loads(line) for line in diary.read_text().splitlines()] if diary.exists() else []
@@ -165,12 +126,13 @@ def attempts(folder: Path) -> list[Any]:
 @pytest.mark.slow
 @pytest.mark.parametrize("code", ["OOM", "MISCONF"])
 def test_a_job_goes_on_while_redis_refuses_writes(
-    redis_server: RedisServer, scripted: Callable[..., Storage], tmp_path: Path, code: str
+    redis_server: RedisServer, tmp_path: Path, code: str
 ) -> None:
     refuse, allow = REFUSALS[code]
+    storage = scripted(tmp_path, steps=60, pause=0.05)
     with (
         connect(redis_server.url, retries=0) as connection,
-        worker(redis_server, scripted(steps=60), tmp_path),
+        running_worker(worker_environment(redis_server, storage, tmp_path)),
     ):
         write_row(connection, JOB)
         queue.enqueue(connection, JOB, 1)
@@ -192,13 +154,14 @@ def test_a_job_goes_on_while_redis_refuses_writes(
 
 @pytest.mark.slow
 def test_an_attempt_ends_by_name_after_the_limit_and_the_job_goes_on(
-    redis_server: RedisServer, scripted: Callable[..., Storage], tmp_path: Path
+    redis_server: RedisServer, tmp_path: Path
 ) -> None:
     refuse, allow = REFUSALS["OOM"]
-    storage = scripted(steps=20)
+    storage = scripted(tmp_path, steps=20, pause=0.05)
+    environment = worker_environment(redis_server, storage, tmp_path, SPLATMILL_REDIS_PATIENCE="1")
     with (
         connect(redis_server.url, retries=0) as connection,
-        worker(redis_server, storage, tmp_path, SPLATMILL_REDIS_PATIENCE="1"),
+        running_worker(environment),
     ):
         write_row(connection, JOB)
         queue.enqueue(connection, JOB, 1)
@@ -212,15 +175,14 @@ def test_an_attempt_ends_by_name_after_the_limit_and_the_job_goes_on(
 
 
 @pytest.mark.slow
-def test_a_worker_begins_when_redis_takes_writes(
-    redis_server: RedisServer, scripted: Callable[..., Storage], tmp_path: Path
-) -> None:
+def test_a_worker_begins_when_redis_takes_writes(redis_server: RedisServer, tmp_path: Path) -> None:
     refuse, allow = REFUSALS["NOREPLICAS"]
+    environment = worker_environment(redis_server, scripted(tmp_path, steps=1), tmp_path)
     with connect(redis_server.url, retries=0) as connection:
         write_row(connection, JOB)
         queue.enqueue(connection, JOB, 1)
         refuse(connection)
-        with worker(redis_server, scripted(steps=1), tmp_path):
+        with running_worker(environment):
             time.sleep(3)  # a worker that gives up at once would be gone
             allow(connection)
             job = wait_for(lambda: (found := read_job(connection, JOB)).state.final and found, 60)

@@ -4,15 +4,11 @@ disk: nothing that was unpacked once a job is cancelled, also after a kill of th
 Does not prove the reservations themselves: tests/server/space/test_reservations.py does.
 """
 
-import contextlib
 import os
 import signal
-import subprocess
-import sys
 import threading
 import time
 import zipfile
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -37,8 +33,8 @@ from splatmill_worker.service.job_folder import JobFolder
 from splatmill_worker.service.lock import JobLock
 from splatmill_worker.service.room import Room
 from tests.support.jobs import CAPTURE, write_row
-from tests.support.paths import ROOT
 from tests.support.redis_server import RedisServer
+from tests.support.up import running_worker, worker_environment
 from tests.support.waiting import wait_for
 
 JOB = "job00001"
@@ -219,24 +215,6 @@ def run(capture, workdir, options, emit, cancelled, *, onlookers=None):
 '''
 
 
-@contextlib.contextmanager
-def worker(server: RedisServer, storage: Storage, folder: Path) -> Iterator[subprocess.Popen[bytes]]:
-    (folder / "unpacking.py").write_text(UNPACKING)
-    environment = dict(os.environ) | {
-        "SPLATMILL_PIPELINE": "unpacking",
-        "PYTHONPATH": f"{ROOT}{os.pathsep}{folder}",
-        "REDIS_URL": server.url,
-        "SPLATMILL_STORAGE": storage.url,
-        "SPLATMILL_DATA": str(folder / "data"),
-    }
-    process = subprocess.Popen([sys.executable, "-m", "splatmill_worker", "train"], env=environment)
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.wait(30)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("killed", [False, True])
 def test_a_cancelled_job_leaves_no_unpacked_file_also_when_its_worker_is_killed(
@@ -251,6 +229,8 @@ def test_a_cancelled_job_leaves_no_unpacked_file_also_when_its_worker_is_killed(
     connection.sadd(keys.ACTIVE, JOB)
     assert queue.enqueue(connection, JOB, 1)
     work = tmp_path / "data" / "work" / JOB
+    (tmp_path / "unpacking.py").write_text(UNPACKING)
+    environment = worker_environment(redis_server, storage, tmp_path, SPLATMILL_PIPELINE="unpacking")
 
     def unpacked() -> list[Path]:
         return [path for path in work.rglob("a.jpg") if ".partial" not in str(path)]
@@ -258,7 +238,7 @@ def test_a_cancelled_job_leaves_no_unpacked_file_also_when_its_worker_is_killed(
     def cancel() -> None:
         connection.hset(keys.job(JOB), "cancel_requested_at", now().isoformat())
 
-    with worker(redis_server, storage, tmp_path) as first:
+    with running_worker(environment, may_end=killed) as first:
         wait_for(lambda: bool(unpacked()))
         assert reservations.used(connection, "default") == 50_000
         if killed:
@@ -275,7 +255,7 @@ def test_a_cancelled_job_leaves_no_unpacked_file_also_when_its_worker_is_killed(
                 time.sleep(0.1)
             wait_for(lambda: reservations.used(connection, "default") < 1000)
     if killed:
-        with worker(redis_server, storage, tmp_path):
+        with running_worker(environment):
             wait_for(lambda: not unpacked())
             wait_for(lambda: reservations.used(connection, "default") < 1000)
     assert not list(work.rglob("*.zip"))

@@ -28,18 +28,8 @@ from tests.support.jobs import CAPTURE, read_job, write_row
 from tests.support.redis_server import RedisServer
 from tests.support.servers import standin
 from tests.support.servers.queue_entries import waiting
-from tests.support.up import STANDIN
+from tests.support.up import running_worker, scripted, worker_environment
 from tests.support.waiting import wait_for
-
-
-@pytest.fixture
-def storage(tmp_path: Path) -> Storage:
-    """Storage with a capture that the stand-in trains in one step, and a diary of its attempts."""
-    storage = Storage((tmp_path / "storage").as_uri())
-    script = json.dumps({"steps": 1, "diary": str(tmp_path / "diary")}).encode()
-    storage.put(layout.capture_file(CAPTURE, Role.images, "script.json"), script)
-    return storage
-
 
 SHIFTED = """
 import datetime, sys, time, rq.utils
@@ -60,21 +50,11 @@ def worker(
     clock_ahead: float = 0.0,
     stderr: IO[bytes] | None = None,
 ) -> Iterator[subprocess.Popen[bytes]]:
-    """A worker whose Python also finds the modules in `folder`, and whose clock is this many seconds ahead."""
-    environment = dict(os.environ) | {
-        **STANDIN,
-        "PYTHONPATH": f"{STANDIN['PYTHONPATH']}{os.pathsep}{folder}",
-        "REDIS_URL": server.url,
-        "SPLATMILL_STORAGE": storage.url,
-        "SPLATMILL_DATA": str(folder / "data"),
-    }
-    command = [sys.executable, "-c", SHIFTED, str(clock_ahead), *options]
-    process = subprocess.Popen(command, env=environment, stderr=stderr)
-    try:
+    """A worker whose clock is this many seconds ahead."""
+    environment = worker_environment(server, storage, folder)
+    program = ("-c", SHIFTED, str(clock_ahead))
+    with running_worker(environment, *options, program=program, stderr=stderr) as process:
         yield process
-    finally:
-        process.terminate()
-        process.wait(30)
 
 
 def ended(server: RedisServer, job_id: str) -> Job | None:
@@ -178,9 +158,8 @@ def test_an_entry_that_belongs_to_no_job_is_removed_and_the_next_one_runs(
     connection.zadd(rq_keys.STARTED, {"nonsense:x": 1, "more nonsense": 1})
     write_row(connection, "job00001")
     assert queue.enqueue(connection, "job00001", 1)
-    with worker(redis_server, storage, tmp_path) as process:
+    with worker(redis_server, storage, tmp_path):
         assert wait_for(partial(ended, redis_server, "job00001")).state == "succeeded"
-        assert process.poll() is None
     assert waiting(connection) == 0
     assert connection.zcard(rq_keys.STARTED) == 0
     assert not any(connection.exists(f"rq:job:{entry}") for entry in foreign)
@@ -192,8 +171,7 @@ def test_a_worker_whose_clock_is_off_runs_its_job_once(
     redis_server: RedisServer, storage: Storage, tmp_path: Path, ahead: float
 ) -> None:
     connection = redis_server.connection
-    script = {"steps": 16, "pause": 0.5, "diary": str(tmp_path / "diary")}
-    storage.put(layout.capture_file(CAPTURE, Role.images, "script.json"), json.dumps(script).encode())
+    scripted(tmp_path, steps=16, pause=0.5)
     write_row(connection, "job00001")
     assert queue.enqueue(connection, "job00001", 1)
     with worker(redis_server, storage, tmp_path, clock_ahead=ahead):
@@ -235,9 +213,7 @@ def test_a_worker_killed_while_it_takes_a_job_loses_none(
     for job_id in ("job00001", "job00002"):
         write_row(connection, job_id)
         assert queue.enqueue(connection, job_id, 1)
-    environment = (
-        dict(os.environ) | STANDIN | {"REDIS_URL": redis_server.url, "SPLATMILL_DATA": str(tmp_path)}
-    )
+    environment = worker_environment(redis_server, storage, tmp_path)
     for _ in range(2):
         killed = subprocess.run([sys.executable, "-c", KILLED, moment], env=environment, timeout=60)
         assert killed.returncode == -signal.SIGKILL
@@ -261,8 +237,7 @@ def test_a_job_for_a_gpu_waits_for_a_worker_that_has_one(
         (listening,) = workers.listening(connection)
         assert listening.lines == ("any", "cpu")
     assert queue.status(connection, "job00001", 1).state == "waiting"
-    environment = dict(os.environ) | STANDIN
-    environment |= {"SPLATMILL_DATA": str(tmp_path / "data"), "SPLATMILL_STORAGE": storage.url}
+    environment = worker_environment(redis_server, storage, tmp_path)
     code = "import sys; from splatmill.backplane.connection import connect; "
     code += "from splatmill_worker.service.rq_worker import AttemptWorker; from tests.support.servers import standin; "
     code += "AttemptWorker(connect(sys.argv[1]), lambda: standin.run, ('gpu',)).work(burst=True)"
@@ -278,9 +253,8 @@ def test_an_entry_whose_record_cannot_be_read_does_not_stop_the_worker(
         write_row(connection, job_id)
         assert queue.enqueue(connection, job_id, 1)
     connection.hset("rq:job:job00001-1", "created_at", "?")
-    with worker(redis_server, storage, tmp_path) as process:
+    with worker(redis_server, storage, tmp_path):
         assert wait_for(partial(ended, redis_server, "job00002")).state == "succeeded"
-        assert process.poll() is None
     # The reaper enqueues what the queue does not know.
     assert queue.status(connection, "job00001", 1).state == "absent"
     assert leases.held(connection) == []

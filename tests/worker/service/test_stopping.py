@@ -3,8 +3,6 @@
 Each program below delivers the signal at one exact point. Does not prove how attempts are stopped: tests/service does.
 """
 
-import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -12,13 +10,11 @@ from pathlib import Path
 import pytest
 
 from splatmill.backplane.queue import leases, queue
-from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.storage import Storage
-from splatmill.schema import Role
-from tests.support.jobs import CAPTURE, read_job, write_row
+from tests.support.jobs import read_job, write_row
 from tests.support.redis_server import RedisServer
 from tests.support.servers.queue_entries import waiting
-from tests.support.up import STANDIN
+from tests.support.up import worker_environment
 
 CONTINUES = 3
 """Exit status of a worker that waits for work after it was told to stop."""
@@ -101,24 +97,9 @@ sys.exit(main(["train"]))
 """
 
 
-@pytest.fixture
-def storage(tmp_path: Path) -> Storage:
-    """Storage with a capture that the stand-in trains in three steps."""
-    storage = Storage((tmp_path / "storage").as_uri())
-    script = json.dumps({"steps": 3, "diary": str(tmp_path / "diary")}).encode()
-    storage.put(layout.capture_file(CAPTURE, Role.images, "script.json"), script)
-    return storage
-
-
 def run(program: str, server: RedisServer, storage: Storage, folder: Path, *arguments: str) -> int:
     """Run a worker to its end and return its exit status."""
-    environment = dict(os.environ) | {
-        **STANDIN,
-        "REDIS_URL": server.url,
-        "SPLATMILL_STORAGE": storage.url,
-        "SPLATMILL_DATA": str(folder / "data"),
-        "SPLATMILL_LOG_FORMAT": "json",
-    }
+    environment = worker_environment(server, storage, folder, SPLATMILL_LOG_FORMAT="json")
     command = [sys.executable, "-c", START + program, *arguments]
     return subprocess.run(command, env=environment, timeout=60).returncode
 

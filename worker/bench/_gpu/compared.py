@@ -14,6 +14,7 @@ from typing import Any
 
 import torch
 from _rows import Row
+from _train.spread import seconds_to
 from torch import Tensor
 
 from .scene import cloud
@@ -21,21 +22,6 @@ from .timing import Place
 
 WIDTH, HEIGHT = 1920, 1080
 MEASURED_AT = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
-
-
-def seconds_to(curve: Sequence[Row], psnr: float) -> float | None:
-    """Training seconds at which a curve first reaches `psnr` dB, by linear interpolation; None
-    when it never does.
-    """
-    before: Row | None = None
-    for row in curve:
-        if row["psnr"] >= psnr:
-            if before is None or row["psnr"] == before["psnr"]:
-                return float(row["seconds"])
-            share = (psnr - before["psnr"]) / (row["psnr"] - before["psnr"])
-            return float(before["seconds"] + share * (row["seconds"] - before["seconds"]))
-        before = row
-    return None
 
 
 def equal(place: Place) -> Iterator[Row]:
@@ -59,8 +45,7 @@ def equal(place: Place) -> Iterator[Row]:
         }  # fmt: skip
         if place.dry:
             continue  # gsplat's kernels need a device
-        import _gsplat
-
+        from _gpu import gsplat
         from splatmill_worker.scene import Camera
         from splatmill_worker.splat.gaussians import Gaussians
         from splatmill_worker.splat.views import Target
@@ -68,10 +53,10 @@ def equal(place: Place) -> Iterator[Row]:
         focal = float(view.K[0, 0])
         eye = Camera(width, height, focal, focal, width / 2, height / 2, np.eye(4))
         target = Target(eye, view.viewmat, view.K, view.photo, None, None)
-        trainer = _gsplat.GsplatTrainer(Gaussians(*view.groups), 1.0)
+        trainer = gsplat.GsplatTrainer(Gaussians(*view.groups), 1.0)
         for optimizer in trainer.optimizers.values():
             optimizer.param_groups[0]["lr"] = 0.0
-        late = 3 * _gsplat.DEGREE_EVERY  # all of SH is in use
+        late = 3 * gsplat.DEGREE_EVERY  # all of SH is in use
         with torch.no_grad():
             rendering = place.median_ms(partial(trainer.render, target, 3))
         yield {
@@ -142,26 +127,25 @@ def _ours(capture: Path, size: int, seconds: float, seed: int) -> Iterator[Row]:
 
 
 def _theirs(capture: Path, size: int, steps: int, seed: int) -> Iterator[Row]:
-    import _gsplat
-
+    from _gpu import gsplat
     from splatmill_worker.pipeline.training import EXTENT
     from splatmill_worker.splat.evaluate import evaluate
 
     _, views, held_out, first = _loaded(capture, size)
     common = {"scene": capture.name, "views": len(views), "held_out": len(held_out), "seed": seed}
-    trainer = _gsplat.GsplatTrainer(first, EXTENT, steps)
+    trainer = gsplat.GsplatTrainer(first, EXTENT, steps)
     for number in range(3):
         trainer.render(views[number % len(views)].full, 0)
     due = [max(1, round(share * steps)) for share in MEASURED_AT]
     seconds = 0.0
     torch.cuda.synchronize()
     started = time.perf_counter()
-    for number, view in enumerate(_gsplat.order(len(views), steps, seed)):
+    for number, view in enumerate(gsplat.order(len(views), steps, seed)):
         trainer.step(views[view].full, number)
         if number + 1 == due[0]:
             torch.cuda.synchronize()
             seconds += time.perf_counter() - started
-            drawn = partial(_drawn, trainer, _gsplat.degree_at(number))
+            drawn = partial(_drawn, trainer, gsplat.degree_at(number))
             with torch.no_grad():
                 score = evaluate(drawn, held_out, torch.zeros(3))
             yield {

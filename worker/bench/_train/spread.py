@@ -33,13 +33,13 @@ class Spread:
         return f"{median} ({self.least:{sign}.{digits}f} to {self.largest:{sign}.{digits}f})"
 
 
-def seconds_to(row: Row, psnr: float) -> float | None:
-    """Training seconds at which a run's curve first reaches `psnr` dB, by linear interpolation.
+def seconds_to(curve: Iterable[Row], psnr: float) -> float | None:
+    """Training seconds at which a curve first reaches `psnr` dB, by linear interpolation.
 
     None where it never does. Where the first point is already above, its seconds are an upper bound.
     """
     before: Row | None = None
-    for point in row["curve"]:
+    for point in curve:
         if point["psnr"] is None:
             continue
         if point["psnr"] >= psnr:

@@ -126,7 +126,7 @@ def levels(timed: list[Row], references: list[Row]) -> str:
         scene, psnr = level["scene"], level["psnr"]
         found: list[tuple[Spread, str]] = []
         for (budget,), group in grouped(_of_scene(timed, scene), "budget").items():
-            reached = [seconds_to(row, psnr) for row in group]
+            reached = [seconds_to(row["curve"], psnr) for row in group]
             known = [seconds for seconds in reached if seconds is not None]
             if len(known) == len(reached):
                 found.append((Spread.of(known), budget))

@@ -187,12 +187,6 @@ def read_states(connection: redis.Redis, job_id: str) -> list[StoredEvent]:
     return decode(cast(Any, connection.xrange(key)), key)
 
 
-def read_progress(connection: redis.Redis, job_id: str) -> list[StoredEvent]:
-    """Return the entries of a job's progress stream that were not trimmed, oldest first."""
-    key = keys.progress(job_id)
-    return decode(cast(Any, connection.xrange(key)), key)
-
-
 def read_log(connection: redis.Redis, job_id: str) -> list[StoredEvent]:
     """Return the log lines of all attempts at a job that were not trimmed, oldest first."""
     stored_events = _read(connection, job_id, keys.log, keys.warnings)

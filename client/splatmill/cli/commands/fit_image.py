@@ -23,16 +23,13 @@ def _fit_image(
     **options: Any,
 ) -> None:
     """Fit one picture with Gaussians; write the model, picture.png and the error over time to DIR."""
-    from pydantic import ValidationError
+    from splatmill.errors import valid_request
 
-    from splatmill.errors import invalid_request
-
-    try:
-        checked = FitImageOptions.model_validate(
-            {name: value for name, value in options.items() if value is not None}
-        )
-    except ValidationError as error:
-        raise invalid_request(error, "option_out_of_range") from error
+    checked = valid_request(
+        FitImageOptions,
+        {name: value for name, value in options.items() if value is not None},
+        "option_out_of_range",
+    )
     require("splatmill_worker", "Fitting a picture")
     exec_module(
         "splatmill_worker",

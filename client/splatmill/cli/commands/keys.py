@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from splatmill.cli.display.tables import JsonLines, local_time, print_lines, print_table
 from splatmill.cli.servers import ServerOption, open_client
 
 if TYPE_CHECKING:
@@ -55,32 +56,24 @@ def create(
 
 
 @keys.command("list")
-def list_keys(
-    server: ServerOption = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object per line and key.")] = False,
-) -> None:
+def list_keys(server: ServerOption = None, as_json: JsonLines = False) -> None:
     """List the keys, the oldest first, without their secrets."""
     with open_client(server) as client:
         listed = client.keys.list()
     if as_json:
-        for key in listed:
-            typer.echo(key.model_dump_json(exclude_none=True))
+        print_lines(listed)
         return
     if not listed:
         typer.echo("There are no stored keys. Create one with: splatmill keys create NAME --scope admin")
         return
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table("key", "name", "owner", "scopes", "limits", "created", box=None, pad_edge=False)
+    rows = []
     for key in listed:
         limits = ", ".join(
             f"{name.replace('_', ' ')} {value}" for name, value in key.limits if value is not None
         )
         scopes = ", ".join(scope.value for scope in key.scopes)
-        created = key.created_at.astimezone().strftime("%Y-%m-%d %H:%M")
-        table.add_row(key.id, key.name, key.owner, scopes, limits or "none", created)
-    Console().print(table)
+        rows.append((key.id, key.name, key.owner, scopes, limits or "none", local_time(key.created_at)))
+    print_table(("key", "name", "owner", "scopes", "limits", "created"), rows)
 
 
 @keys.command()

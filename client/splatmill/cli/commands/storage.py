@@ -1,18 +1,15 @@
 """`splatmill storage`: who holds what, the largest records, and what is deleted next."""
 
-from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from splatmill.cli.display.tables import print_table
 from splatmill.cli.servers import ServerOption, open_client
 
 if TYPE_CHECKING:
     from splatmill.schema import StorageUse, StoredRecord
-
-WIDTH = 200
-"""Characters per line of what is not printed on a terminal."""
 
 
 def storage(
@@ -31,17 +28,12 @@ def storage(
     if as_json:
         typer.echo(use.model_dump_json(indent=2))
         return
-    from rich.console import Console
-
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=WIDTH)  # for programs and files, which have no width of their own
-    _print_owners(console, use)
-    _print_largest(console, use)
-    _print_deletions(console, use)
+    _print_owners(use)
+    _print_largest(use)
+    _print_deletions(use)
 
 
-def _print_owners(console: object, use: "StorageUse") -> None:
+def _print_owners(use: "StorageUse") -> None:
     from splatmill.schema import format_bytes
 
     rows = []
@@ -50,12 +42,10 @@ def _print_owners(console: object, use: "StorageUse") -> None:
         sizes = (owner_use.bytes, kinds.captures, kinds.sfm, kinds.jobs, kinds.models, kinds.uploads)
         limit = "none" if owner_use.limit is None else format_bytes(owner_use.limit)
         rows.append((owner_use.owner or "(nobody)", *(format_bytes(size) for size in sizes), limit))
-    _print_table(
-        console, ("owner", "total", "captures", "cameras", "jobs", "models", "uploads", "limit"), rows
-    )
+    print_table(("owner", "total", "captures", "cameras", "jobs", "models", "uploads", "limit"), rows)
 
 
-def _print_largest(console: object, use: "StorageUse") -> None:
+def _print_largest(use: "StorageUse") -> None:
     from splatmill.schema import format_bytes
 
     if not use.largest:
@@ -65,9 +55,9 @@ def _print_largest(console: object, use: "StorageUse") -> None:
     now = datetime.now(UTC)
     rows = [
         (
-            record.kind.value,
             record.id,
             record.name or "",
+            record.kind.value,
             record.owner or "(nobody)",
             format_bytes(record.bytes),
             _ago(record.last_used, now),
@@ -75,31 +65,18 @@ def _print_largest(console: object, use: "StorageUse") -> None:
         )
         for record in use.largest
     ]
-    _print_table(console, ("kind", "id", "name", "owner", "size", "last used", "deleted"), rows)
+    print_table(("id", "name", "kind", "owner", "size", "last used", "deleted"), rows)
 
 
-def _print_deletions(console: object, use: "StorageUse") -> None:
+def _print_deletions(use: "StorageUse") -> None:
     from splatmill.schema import format_bytes
 
     if not use.deletions:
         typer.echo("\nThe next sweep deletes nothing.")
         return
     typer.echo(f"\nThe next sweep deletes {format_bytes(sum(record.bytes for record in use.deletions))}:")
-    rows = [(record.kind, record.id, format_bytes(record.bytes), record.reason) for record in use.deletions]
-    _print_table(console, ("kind", "id", "size", "reason"), rows)
-
-
-def _print_table(console: object, heads: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    assert isinstance(console, Console)
-    table = Table(box=None, pad_edge=False)
-    for head in heads:
-        table.add_column(head, overflow="fold")
-    for row in rows:
-        table.add_row(*row)
-    console.print(table)
+    rows = [(record.id, record.kind, format_bytes(record.bytes), record.reason) for record in use.deletions]
+    print_table(("id", "kind", "size", "reason"), rows)
 
 
 def _fate(record: "StoredRecord", now: datetime) -> str:

@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from splatmill.cli.display.tables import JsonLines, print_lines
 from splatmill.cli.servers import ServerOption, open_client
 
 if TYPE_CHECKING:
@@ -17,7 +18,6 @@ webhooks = typer.Typer(
 )
 
 WebhookId = Annotated[str, typer.Argument(metavar="WEBHOOK", help="Id of the webhook.", show_default=False)]
-AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object per line.")]
 
 
 @webhooks.command()
@@ -38,13 +38,12 @@ def create(
 
 
 @webhooks.command("list")
-def list_webhooks(server: ServerOption = None, as_json: AsJson = False) -> None:
+def list_webhooks(server: ServerOption = None, as_json: JsonLines = False) -> None:
     """List the webhooks, the oldest first, without their secrets."""
     with open_client(server) as client:
         listed = client.webhooks.list()
     if as_json:
-        for webhook in listed:
-            typer.echo(webhook.model_dump_json(exclude_none=True))
+        print_lines(listed)
         return
     if not listed:
         typer.echo("There are no webhooks. Create one with: splatmill webhooks create URL")
@@ -80,14 +79,14 @@ def enable(webhook_id: WebhookId, server: ServerOption = None) -> None:
 
 
 @webhooks.command()
-def deliveries(webhook_id: WebhookId, server: ServerOption = None, as_json: AsJson = False) -> None:
+def deliveries(webhook_id: WebhookId, server: ServerOption = None, as_json: JsonLines = False) -> None:
     """List what was delivered, newest first, with every attempt."""
     with open_client(server) as client:
         deliveries = client.webhooks.deliveries(webhook_id)
+    if as_json:
+        print_lines(deliveries)
+        return
     for delivery in deliveries:
-        if as_json:
-            typer.echo(delivery.model_dump_json(exclude_none=True))
-            continue
         created = delivery.created_at.astimezone().strftime("%Y-%m-%d %H:%M:%S")
         typer.echo(
             f"{delivery.id}  {created}  {delivery.event.value}  {delivery.job}  {delivery.state.value}"

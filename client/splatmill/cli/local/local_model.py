@@ -58,16 +58,11 @@ def render_local(
 
     options: output, format and background of `RenderRequest`.
     """
-    from pydantic import ValidationError
-
-    from splatmill.errors import invalid_request
+    from splatmill.errors import valid_request
     from splatmill.schema import CameraSpec, RenderRequest
 
     shown = camera or CameraSpec.looking_at((1, 0, 0), (0, 0, 0), width=16, height=16)
-    try:
-        request = RenderRequest.model_validate({**options, "camera": shown})
-    except ValidationError as error:
-        raise invalid_request(error, "camera_invalid") from error
+    request = valid_request(RenderRequest, {**options, "camera": shown}, "camera_invalid")
     if camera is None:
         typer.echo(f"The image shows the dense middle of the scene from the side, with {up} up.", err=True)
     body = request.model_dump_json(exclude_none=True, exclude={"camera"} if camera is None else None)
@@ -79,15 +74,10 @@ def orbit_local(
     model: Path, out: Path, options: Mapping[str, Any], *, with_cameras: bool, up: str
 ) -> NoReturn:
     """Render a video that circles the scene of a model file and end. `options` are fields of `OrbitRequest`."""
-    from pydantic import ValidationError
-
-    from splatmill.errors import invalid_request
+    from splatmill.errors import valid_request
     from splatmill.schema import OrbitRequest
 
-    try:
-        request = OrbitRequest.model_validate(options)
-    except ValidationError as error:
-        raise invalid_request(error) from error
+    request = valid_request(OrbitRequest, options)
     if not with_cameras and request.camera_path is None:
         typer.echo(f"The camera circles the dense middle of the scene, with {up} up.", err=True)
     cameras = ("--cameras", str(_cameras_path(model))) if with_cameras else ()

@@ -28,6 +28,7 @@ from splatmill_worker.images.colors.photo_colors import PhotoColors
 from splatmill_worker.images.decoding import decoders
 from splatmill_worker.images.prepare import prepare
 from splatmill_worker.sfm import posed
+from tests.support.posed_sets import frames
 from tests.worker.images.video.test_video_frame import (
     KR_KB,
     TO_BT2020,
@@ -454,16 +455,13 @@ def test_hdr_photos_are_converted_as_the_rule_has_it_in_all_colours(colors: Colo
 
 def test_photos_that_come_with_cameras_are_named_too(tmp_path: Path) -> None:
     (tmp_path / "images").mkdir()
-    frames = []
-    for number in range(3):
-        name = f"images/{number}.jpg"
+    names = [f"{number}.jpg" for number in range(3)]
+    for number, name in enumerate(names):
         profile = DISPLAY_P3 if number else None
-        Image.fromarray(stored(TO_P3)).save(tmp_path / name, icc_profile=profile, quality=90 + number)
-        matrix = np.eye(4)
-        matrix[0, 3] = number
-        frames.append({"file_path": name, "transform_matrix": matrix.tolist()})
-    document = {"camera_angle_x": 1.0, "frames": frames}
-    (tmp_path / "transforms.json").write_text(json.dumps(document))
+        Image.fromarray(stored(TO_P3)).save(
+            tmp_path / "images" / name, icc_profile=profile, quality=90 + number
+        )
+    (tmp_path / "transforms.json").write_text(json.dumps({"camera_angle_x": 1.0, "frames": frames(names)}))
     given = posed.find(tmp_path)
     assert given is not None
     assert "Colours of 2 of 3 photos: converted to sRGB from Display P3." in given.load().warnings

@@ -34,6 +34,7 @@ from splatmill_worker.images.video import video as video_here
 from splatmill_worker.readers import reader_memory
 from splatmill_worker.service.attempts.problems import is_transient, keeps_progress, problem_of
 from splatmill_worker.sfm import posed
+from tests.support import posed_sets
 from tests.support.decoding.acting import acts, children
 from tests.support.hostile.videos import video
 
@@ -188,14 +189,8 @@ def test_photos_with_cameras_are_left_out_and_the_job_is_tried_again_likewise(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     capture = tmp_path / "capture"
-    (capture / "images").mkdir(parents=True)
-    frames = []
-    for number in range(2):
-        Image.new("RGB", (64, 48), (number, 0, 0)).save(capture / "images" / f"{number}.png")
-        matrix = np.eye(4)
-        matrix[0, 3] = number
-        frames.append({"file_path": f"images/{number}.png", "transform_matrix": matrix.tolist()})
-    (capture / "transforms.json").write_text(json.dumps({"camera_angle_x": 0.8, "frames": frames}))
+    posed_sets.photos(capture / "images", ["0.png", "1.png"])
+    posed_sets.transforms(capture / "transforms.json", posed_sets.frames(["0.png", "1.png"]))
     given = posed.find(capture)
     assert given is not None
     with confined([capture]):
@@ -221,12 +216,7 @@ def test_a_photo_that_ends_its_process_when_it_is_loaded_is_left_out_by_the_next
     capture, work, kept = tmp_path / "capture", tmp_path / "work", tmp_path / "ended.json"
     capture.mkdir()
     (tmp_path / "photos").rename(capture / "images")
-    flip = np.diag([1.0, -1.0, -1.0, 1.0])
-    frames = [
-        {"file_path": f"images/{name}", "transform_matrix": (np.linalg.inv(camera.viewmat) @ flip).tolist()}
-        for name, camera in cameras.items()
-    ]
-    (capture / "transforms.json").write_text(json.dumps({"camera_angle_x": 0.8, "frames": frames}))
+    (capture / "transforms.json").write_text(json.dumps(posed_sets.document(cameras)))
     bad = sorted(cameras)[3]
     original = DecoderProcess.ask
 

@@ -17,6 +17,7 @@ from splatmill_worker.images.panoramas import faces
 from splatmill_worker.scene import Camera, Lens, PointViews, Scene, View
 from splatmill_worker.synthetic.ray_caster import picture
 from tests.support import panoramas
+from tests.support.scenes.photos import psnr
 
 WIDTH = 256
 
@@ -34,10 +35,6 @@ def view(tmp_path_factory: pytest.TempPathFactory) -> View:
     (pose,) = panoramas.walk(1)
     panoramas.write(folder, [pose], WIDTH, samples=1)
     return whole(folder / "pano_00.jpg", pose)
-
-
-def psnr(a: np.ndarray, b: np.ndarray) -> float:
-    return float(10 * np.log10(255**2 / np.square(a.astype(float) - b).mean()))
 
 
 @pytest.mark.parametrize("name", faces.FACES)

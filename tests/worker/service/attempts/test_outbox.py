@@ -11,6 +11,7 @@ from splatmill.schema import Event, JobState, LogEvent, PlanEvent, ProgressEvent
 from splatmill_worker.service.attempts.attempt import Attempt
 from splatmill_worker.service.attempts.outbox import Outbox
 from splatmill_worker.service.lock import JobLock
+from tests.support.jobs import read_progress
 from tests.support.redis_server import RedisServer
 
 
@@ -23,7 +24,7 @@ def test_events_keep_their_order_and_progress_is_thinned(connection: redis.Redis
     outbox.put(LogEvent(message="done"))
     outbox.put(StateEvent(state=JobState.exporting))
     outbox.close()
-    sent = [stored.event for stored in events.read_progress(connection, "job00001")]
+    sent = [stored.event for stored in read_progress(connection, "job00001")]
     steps = [event.step for event in sent if isinstance(event, ProgressEvent)]
     assert len(steps) < 50
     assert steps[-1] == 500

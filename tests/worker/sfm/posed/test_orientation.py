@@ -22,7 +22,7 @@ from splatmill_worker.sfm.features import Features
 from splatmill_worker.sfm.posed.judged import orientation
 from splatmill_worker.sfm.posed.judged.searched import database_of, epipolar_errors, model_of
 from splatmill_worker.synthetic import orbit, photograph, still_life
-from tests.support.posed_sets import FLIP
+from tests.support.posed_sets import frame_of
 
 STORED = UPRIGHT | {6: UPRIGHT[8], 8: UPRIGHT[6]}
 """What makes a stored photo of an upright one, of each EXIF orientation: the inverse of UPRIGHT."""
@@ -61,11 +61,10 @@ def capture(
         turn = STORED.get(tag) if upright else None
         stored = photo if turn is None else photo.transpose(turn)
         stored.save(folder / "images" / f"{index}.png", exif=exif)
-        matrix = np.linalg.inv(camera.viewmat) @ FLIP
         lens = {"fl_x": camera.fx, "fl_y": camera.fy}
         if sized:
             lens |= {"w": camera.width, "h": camera.height, "cx": camera.cx, "cy": camera.cy}
-        frames.append({"file_path": f"images/{index}.png", "transform_matrix": matrix.tolist(), **lens})
+        frames.append(frame_of(f"{index}.png", camera.viewmat, **lens))
     (folder / "transforms.json").write_text(json.dumps({"frames": frames}))
     given = posed.find(folder)
     assert given is not None

@@ -21,10 +21,10 @@ from splatmill_worker.scene import Camera, Float, Lens, Scene, Source, View, vie
 from splatmill_worker.sfm import posed, stereo
 from splatmill_worker.sfm.matching.overlap import by_overlap
 from splatmill_worker.sfm.options import LEAN
-from splatmill_worker.sfm.posed.judged.conventions import FLIP
 from splatmill_worker.sfm.posed.judged.triangulation import Triangulated, triangulate
 from splatmill_worker.splat.plan.decide import decide
 from tests.support.plans.facts import FACTS
+from tests.support.posed_sets import FLIP, document
 
 pytestmark = pytest.mark.slow
 
@@ -108,20 +108,8 @@ def test_colours_are_those_of_the_photos(bare: Scene, found: Triangulated) -> No
     assert np.median(np.abs(there - found.colors[own])) < 15
 
 
-def opengl(camera: Camera) -> list[list[float]]:
-    matrix = np.eye(4)
-    matrix[:3, :3] = camera.viewmat[:3, :3].T @ np.diag([1.0, -1.0, -1.0])
-    matrix[:3, 3] = camera.center
-    return [[float(value) for value in row] for row in matrix]
-
-
 def transforms(truth: Truth, names: list[str]) -> str:
-    camera = next(iter(truth.values()))
-    lens = {"w": WIDTH, "h": HEIGHT, "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
-    frames = [
-        {"file_path": f"images/{name}", "transform_matrix": opengl(truth[name])} for name in sorted(names)
-    ]
-    return json.dumps(lens | {"frames": frames})
+    return json.dumps(document({name: truth[name] for name in sorted(names)}))
 
 
 def colmap_model(truth: Truth) -> pycolmap.Reconstruction:

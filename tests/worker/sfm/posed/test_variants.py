@@ -17,6 +17,7 @@ from splatmill_worker.sfm.posed import text as model_text
 from splatmill_worker.sfm.posed.model_files import read
 from splatmill_worker.sfm.posed.written import model_of
 from tests.support.posed_sets import ALL, NAMES, check, frames, image_lines, loaded, model, photos, transforms
+from tests.worker.sfm.posed.test_posed import PLY
 
 # Names with spaces in text.
 
@@ -49,16 +50,6 @@ def test_names_with_spaces_survive_the_text_that_is_written(
 
 
 # Text as other programs write it.
-
-PLY = """ply
-format ascii 1.0
-element vertex 1
-property float x
-property float y
-property float z
-end_header
-1 2 3
-"""
 
 WRITERS: dict[str, Callable[[str], bytes]] = {
     "a byte-order mark": lambda text: text.encode("utf-8-sig"),

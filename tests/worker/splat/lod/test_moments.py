@@ -9,8 +9,9 @@ import math
 
 import torch
 
+from splatmill_worker.kernels.reference.project import rotation
 from splatmill_worker.splat.lod import moments
-from splatmill_worker.splat.lod.moments import areas, extents, gaussians_of, merged, moments_of
+from splatmill_worker.splat.lod.moments import areas, extents, gaussians_of, merged, moments_of, quaternions
 from tests.support.gaussians import differences, some_gaussians
 
 
@@ -30,6 +31,12 @@ def test_gaussians_survive_as_moments() -> None:
     assert found["opacities"] < 1e-6
     assert found["dc"] == 0
     assert torch.allclose(back.log_scales.sort(1).values, scene.log_scales.sort(1).values, atol=1e-5)
+
+
+def test_a_quaternion_is_that_of_its_rotation() -> None:
+    q = torch.randn(50, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    q[0], q[1] = torch.tensor([0.0, 1, 0, 0]), torch.tensor([0.0, 0, -1, 0])
+    assert torch.allclose(rotation(quaternions(rotation(q))), rotation(q), atol=1e-14)
 
 
 def test_the_area_is_the_root_mean_square_over_all_directions() -> None:

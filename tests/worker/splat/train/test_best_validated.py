@@ -10,15 +10,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import pytest
 import torch
 
 from splatmill_worker.splat.plan.plan import Plan
-from splatmill_worker.splat.train import checkpoint, curve
+from splatmill_worker.splat.train import checkpoint
 from splatmill_worker.splat.train.loop import Hooks, train
 from splatmill_worker.splat.train.snapshot import Snapshot
 from splatmill_worker.splat.train.stopping import TAIL
 from tests.support.training import first_engine, plan, split
+from tests.support.training import gains_of_short_runs as gains_of_short_runs
 
 STEPS = 100
 BEST = 11  # a point of the curve, after which the scene gets worse
@@ -43,11 +43,6 @@ class Worsening:
             )
             self._engine.replace(parameters, *self._engine.moments())
         return result
-
-
-@pytest.fixture(autouse=True)
-def _gains_of_short_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(curve, "GAIN_FROM", 0)
 
 
 def course() -> Plan:

@@ -15,16 +15,12 @@ import torch
 
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.plan.rates import Annealing, boost_of
-from splatmill_worker.splat.train import checkpoint, curve, observers
+from splatmill_worker.splat.train import checkpoint, observers
 from splatmill_worker.splat.train.loop import Hooks, train
 from splatmill_worker.splat.train.run import TrainingRun
 from splatmill_worker.splat.train.snapshot import Snapshot
 from tests.support.training import first_engine, plan, split
-
-
-@pytest.fixture(autouse=True)
-def _gains_of_short_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(curve, "GAIN_FROM", 0)
+from tests.support.training import gains_of_short_runs as gains_of_short_runs
 
 
 def course(least: float = 0.0, longest: int | None = 400, steps: int = 100) -> Plan:

@@ -18,6 +18,7 @@ from torch import Tensor
 from _studies.functions.tolerances import U
 from splatmill_worker.kernels import ops
 from splatmill_worker.kernels.records import Projected
+from splatmill_worker.splat.lod.moments import quaternions
 
 from .scenes import Scene, draws, rounded
 
@@ -158,7 +159,7 @@ def placed(splats: Sequence[Splat], at: Lens) -> Scene:
         Scene(
             means=(points - at.shift) @ at.turn,
             log_scales=torch.stack([s.log_scales for s in splats]),
-            quats=torch.stack([quaternion(at.turn.T @ s.axes) for s in splats]),
+            quats=quaternions(torch.stack([at.turn.T @ s.axes for s in splats])),
             logit_opacities=torch.tensor([s.logit for s in splats], dtype=torch.float64),
             sh=sh,
             viewmat=viewmat,
@@ -167,24 +168,6 @@ def placed(splats: Sequence[Splat], at: Lens) -> Scene:
             height=SIDE,
         )
     )
-
-
-def quaternion(R: Tensor) -> Tensor:
-    """The unit quaternion [4] of a rotation [3,3], from its largest component (Shepperd 1978)."""
-    xx, yy, zz = (float(R[i, i]) for i in range(3))
-    squares = [1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz]
-    differences = [float(R[2, 1] - R[1, 2]), float(R[0, 2] - R[2, 0]), float(R[1, 0] - R[0, 1])]
-    xy, xz, yz = float(R[0, 1] + R[1, 0]), float(R[0, 2] + R[2, 0]), float(R[1, 2] + R[2, 1])
-    wx, wy, wz = differences
-    rows = [
-        [squares[0], wx, wy, wz],
-        [wx, squares[1], xy, xz],
-        [wy, xy, squares[2], yz],
-        [wz, xz, yz, squares[3]],
-    ]
-    row = torch.tensor(rows[squares.index(max(squares))], dtype=torch.float64)
-    unit: Tensor = row / row.norm()
-    return unit
 
 
 def several(count: int) -> Callable[[Numbers], Scene]:

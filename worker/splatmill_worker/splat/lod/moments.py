@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from splatmill_worker.kernels.reference.project import rotation
 from splatmill_worker.splat.gaussians import Gaussians
 
 MOST_OPAQUE = 0.999
@@ -131,7 +132,7 @@ def gaussians_of(moments: Moments) -> Gaussians:
     return Gaussians(
         shapes.means.float(),
         (0.5 * variances.log()).float(),
-        _quaternions(axes).float(),
+        quaternions(axes).float(),
         torch.logit(opacities).float(),
         moments.sh.reshape(moments.count, -1, 3),
     )
@@ -155,21 +156,10 @@ def extents(gaussians: Gaussians) -> Tensor:
 
 def _axes(gaussians: Gaussians) -> Tensor:
     """The axes of Gaussians as the columns of [N, 3, 3], each as long as its standard deviation."""
-    return _rotations(gaussians.quats.double()) * gaussians.log_scales.double().exp()[:, None, :]
+    return rotation(gaussians.quats.double()) * gaussians.log_scales.double().exp()[:, None, :]
 
 
-def _rotations(quats: Tensor) -> Tensor:
-    """The matrices [N, 3, 3] of quaternions wxyz of any norm above zero."""
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=1, eps=0.0).unbind(1)
-    rows = (
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    )  # fmt: skip
-    return torch.stack(rows, 1).reshape(-1, 3, 3)
-
-
-def _quaternions(matrices: Tensor) -> Tensor:
+def quaternions(matrices: Tensor) -> Tensor:
     """Unit quaternions wxyz [N, 4] of rotation matrices [N, 3, 3].
 
     Each row of the symmetric matrix 4 q q^T is a multiple of the quaternion; the one with the largest diagonal entry is

@@ -51,9 +51,7 @@ def clean(
     ] = None,
 ) -> None:
     """Write a model file without Gaussians that its photos do not support, and print how many went for what reason."""
-    from pydantic import ValidationError
-
-    from splatmill.errors import invalid_request
+    from splatmill.errors import valid_request
     from splatmill.schema import EditModel
     from splatmill.schema.files.formats import MODEL_FORMATS, format_of
 
@@ -74,10 +72,7 @@ def clean(
             )
     arguments: list[str] = []
     if box is not None:
-        try:
-            edit = EditModel.model_validate({"box": {"min": box[:3], "max": box[3:]}})
-        except ValidationError as error:
-            raise invalid_request(error, "option_out_of_range") from error
+        edit = valid_request(EditModel, {"box": {"min": box[:3], "max": box[3:]}}, "option_out_of_range")
         arguments += ["--edit", edit.model_dump_json(exclude_none=True)]
     if capture is not None:
         arguments += ["--capture", str(capture)]

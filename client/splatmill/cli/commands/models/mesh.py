@@ -65,9 +65,7 @@ def mesh(
 
     A file is meshed on this machine. Ctrl-C cancels a mesh on the server.
     """
-    from pydantic import ValidationError
-
-    from splatmill.errors import invalid_request
+    from splatmill.errors import valid_request
     from splatmill.schema import MeshRequest
 
     if out.suffix.lower() not in SUFFIXES:
@@ -80,10 +78,7 @@ def mesh(
     }
     if box is not None:
         wish["box"] = {"min": box[:3], "max": box[3:]}
-    try:
-        request = MeshRequest.model_validate(wish)
-    except ValidationError as error:
-        raise invalid_request(error, "option_out_of_range") from error
+    request = valid_request(MeshRequest, wish, "option_out_of_range")
     if is_local(model):
         _mesh_file(Path(model), out, request, cameras, up or "-y")
     for value, hint in ((cameras, "--cameras"), (up, "--up")):

@@ -201,30 +201,20 @@ def _camera(
 
 
 def _read_path(path: Path) -> "CameraPath":
-    from pydantic import ValidationError
-
-    from splatmill.errors import invalid_request
+    from splatmill.errors import valid_request
     from splatmill.schema import CameraPath
 
     if not path.is_file():
         raise typer.BadParameter(f"There is no file {path}.", param_hint="--path")
-    try:
-        return CameraPath.model_validate_json(path.read_bytes())
-    except ValidationError as error:
-        raise invalid_request(error) from error
+    return valid_request(CameraPath, path.read_bytes())
 
 
 def _read_camera(path: Path) -> "CameraSpec":
-    from pydantic import ValidationError
-
-    from splatmill.errors import invalid_request
+    from splatmill.errors import valid_request
     from splatmill.schema import CameraSpec
 
     if not path.is_file():
         raise typer.BadParameter(
             f"{path} is neither a file nor the number of a camera.", param_hint="--camera"
         )
-    try:
-        return CameraSpec.model_validate_json(path.read_bytes())
-    except ValidationError as error:
-        raise invalid_request(error, "camera_invalid") from error
+    return valid_request(CameraSpec, path.read_bytes(), "camera_invalid")

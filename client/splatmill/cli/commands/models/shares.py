@@ -5,6 +5,7 @@ from typing import Annotated
 import typer
 
 from splatmill.cli.commands.models.models import ModelId
+from splatmill.cli.display.tables import JsonLines, local_time, print_lines, print_table
 from splatmill.cli.servers import ServerOption, open_client
 
 shares = typer.Typer(
@@ -38,24 +39,22 @@ def create(
 
 
 @shares.command("list")
-def list_shares(
-    model_id: ModelId,
-    server: ServerOption = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object per line.")] = False,
-) -> None:
+def list_shares(model_id: ModelId, server: ServerOption = None, as_json: JsonLines = False) -> None:
     """List the links to a model, newest first, without their addresses."""
     with open_client(server) as client:
         listed = client.model(model_id).shares.list()
     if as_json:
-        for share in listed:
-            typer.echo(share.model_dump_json(exclude_none=True))
+        print_lines(listed)
         return
     if not listed:
         typer.echo(f"There are no links to this model. Create one with: splatmill shares create {model_id}")
+        return
+    rows = []
     for share in listed:
         state = "revoked" if share.revoked_at else "valid until" if share.active else "expired"
-        until = share.revoked_at or share.expires_at
-        typer.echo(f"{share.id}  {state} {until:%Y-%m-%d %H:%M}" + (f"  {share.name}" if share.name else ""))
+        until = local_time(share.revoked_at or share.expires_at)
+        rows.append((share.id, share.name or "", f"{state} {until}"))
+    print_table(("link", "name", "state"), rows)
 
 
 @shares.command()

@@ -1,10 +1,8 @@
 // Meshes: made by the server in the background, kept with the model, and saved.
 
-import { get, request, send } from "../api.js";
 import { h } from "../dom.js";
 import { bytes, number } from "../format.js";
-import { noticeOf } from "../shell.js";
-import { follow } from "./kept.js";
+import { keptOf } from "./kept.js";
 
 /**
  * @import {Shown} from "./model.js"
@@ -27,11 +25,18 @@ export async function showMesh(section, { model, address }, stage) {
     h("option", { value: "" }, "of the corners"), TEXTURES.map((side) => h("option", { value: side }, `a texture of ${number(side)} pixels`)));
   const box = h("input", { type: "checkbox", id: "mesh-box" });
   const make = h("button", { type: "button", onclick: start }, "Make a mesh");
-  const stop = h("button", { type: "button", class: "quiet", hidden: true }, "Stop");
-  const state = h("p", { class: "hint", role: "status" });
-  const place = h("div");
-  const kept = h("ul", { class: "kept" });
-  const refused = (/** @type {Error} */ error) => place.append(noticeOf(error));
+  const { stop, state, place, kept, begin, open } = keptOf(address, "meshes", make, {
+    progress: ({ progress }) => {
+      const count = progress?.total ? `, ${progress.done} of ${progress.total}` : "";
+      return `${progress ? progress.stage : "waiting"}${count}. This takes some minutes; the server continues if this page is closed.`;
+    },
+    failure: ({ detail, advice }) => `${detail} ${advice ?? ""}`,
+    entry: (mesh) => {
+      const name = `.${mesh.request.format}, ${number(mesh.facts.triangles)} triangles${mesh.request.texture ? " with a texture" : ""}${mesh.request.box ? " of a box" : ""}, ${bytes(mesh.bytes)}`;
+      const download = `${model.name || model.id}-mesh.${mesh.request.format}`;
+      return { name: `the mesh ${name}`, use: h("a", { class: "button quiet", href: mesh.links.file, download }, `Save ${name}`) };
+    },
+  });
 
   async function start() {
     place.replaceChildren();
@@ -40,59 +45,11 @@ export async function showMesh(section, { model, address }, stage) {
       stage.edit.button.focus();
       return;
     }
-    make.disabled = true;
-    try {
-      await show(await send("POST", `${address}/meshes`, {
-        format: format.value, faces: Number(faces.value),
-        ...(colors.value && !colors.disabled ? { texture: Number(colors.value) } : {}),
-        ...(box.checked ? { box: stage.edit.box } : {}),
-      }));
-    } catch (error) {
-      refused(/** @type {Error} */ (error));
-    } finally {
-      make.disabled = false;
-    }
-  }
-
-  /** Say what is done until a mesh is whole. @param {any} begun */
-  async function show(begun) {
-    make.disabled = true;
-    try {
-      const mesh = await follow(begun, stop, ({ progress }) => {
-        const count = progress?.total ? `, ${progress.done} of ${progress.total}` : "";
-        state.textContent = `${progress ? progress.stage : "waiting"}${count}. This takes some minutes; the server continues if this page is closed.`;
-      }, refused);
-      state.textContent = !mesh ? "Stopped." : mesh.state === "failed" ? `${mesh.problem.detail} ${mesh.problem.advice ?? ""}` : "";
-      if (mesh?.state === "succeeded") await list();
-    } catch (error) {
-      state.textContent = "";
-      throw error;
-    } finally {
-      make.disabled = false;
-    }
-  }
-
-  /** List the meshes that are kept, and return those that are not whole yet. */
-  async function list() {
-    /** @type {any[]} */
-    const meshes = (await get(`${address}/meshes`)).meshes;
-    kept.replaceChildren(...meshes.filter(({ state }) => state === "succeeded").map((mesh) => {
-      const name = `.${mesh.request.format}, ${number(mesh.facts.triangles)} triangles${mesh.request.texture ? " with a texture" : ""}${mesh.request.box ? " of a box" : ""}, ${bytes(mesh.bytes)}`;
-      return h("li", {},
-        h("a", { class: "button quiet", href: mesh.links.file, download: `${model.name || model.id}-mesh.${mesh.request.format}` }, `Save ${name}`),
-        h("button", { type: "button", class: "quiet", "aria-label": `Delete the mesh ${name}`, onclick: () => remove(mesh) }, "Delete"));
-    }));
-    return meshes.filter(({ state }) => state === "queued" || state === "running");
-  }
-
-  /** @param {any} mesh */
-  async function remove(mesh) {
-    try {
-      await request("DELETE", mesh.links.self);
-      await list();
-    } catch (error) {
-      refused(/** @type {Error} */ (error));
-    }
+    await begin({
+      format: format.value, faces: Number(faces.value),
+      ...(colors.value && !colors.disabled ? { texture: Number(colors.value) } : {}),
+      ...(box.checked ? { box: stage.edit.box } : {}),
+    });
   }
 
   section.append(h("h2", { id: "mesh-title" }, "Mesh"),
@@ -103,10 +60,5 @@ export async function showMesh(section, { model, address }, stage) {
       h("div", { class: "field" }, h("label", { for: "mesh-faces" }, "Most triangles"), faces)),
     h("label", { class: "row", for: "mesh-box" }, box, "Only what lies in the box of Crop and clean"),
     h("div", { class: "row" }, make, stop), state, place, kept);
-  try {
-    const [unfinished] = await list();
-    if (unfinished) await show(unfinished);
-  } catch (error) {
-    refused(/** @type {Error} */ (error));
-  }
+  await open();
 }

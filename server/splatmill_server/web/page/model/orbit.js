@@ -1,10 +1,8 @@
 // Videos on a circle or on a camera path: rendered by the server in the background, kept with the model, played here, and saved.
 
-import { get, request, send } from "../api.js";
 import { h } from "../dom.js";
 import { bytes } from "../format.js";
-import { noticeOf } from "../shell.js";
-import { follow } from "./kept.js";
+import { keptOf } from "./kept.js";
 
 /**
  * @import {Shown} from "./model.js"
@@ -25,11 +23,23 @@ export async function showOrbit(section, { model, address, background }, stage) 
   const size = h("select", { id: "orbit-size" }, Object.keys(SIZES).map((name) => h("option", {}, name)));
   const length = h("input", { id: "orbit-length", type: "number", min: 0.5, max: 60, step: "any", value: 6, class: "narrow-field" });
   const make = h("button", { type: "button", onclick: start }, "Make the video");
-  const stop = h("button", { type: "button", class: "quiet", hidden: true }, "Stop");
-  const state = h("p", { class: "hint", role: "status" });
   const bar = h("progress", { hidden: true, "aria-label": "Frames rendered" });
-  const place = h("div");
-  const kept = h("ul", { class: "kept" });
+  const { stop, state, place, kept, begin, open } = keptOf(address, "orbits", make, {
+    progress: ({ frames, frames_done }) => {
+      bar.hidden = false;
+      bar.max = frames;
+      bar.value = frames_done;
+      return `${frames_done} of ${frames} frames are rendered. The server continues if this page is closed.`;
+    },
+    failure: ({ detail }) => detail,
+    entry: (orbit) => {
+      const { width, height, seconds } = orbit.request;
+      const name = `${orbit.request.camera_path ? "camera path" : "circle"}, ${width} x ${height}, ${seconds} seconds, ${bytes(orbit.bytes)}`;
+      return { name: `the video ${name}`, use: h("button", { type: "button", class: "quiet", onclick: () => play(orbit) }, `Play ${name}`) };
+    },
+    whole: play,
+    over: () => { bar.hidden = true; },
+  });
 
   async function start() {
     const [width, height] = SIZES[/** @type {keyof typeof SIZES} */ (size.value)];
@@ -47,38 +57,7 @@ export async function showOrbit(section, { model, address, background }, stage) 
       length.focus();
       return;
     }
-    make.disabled = true;
-    try {
-      await show(await send("POST", `${address}/orbits`, { seconds: Number(length.value), width, height, background, ...(path ? { camera_path: path } : {}) }));
-    } catch (error) {
-      place.append(noticeOf(/** @type {Error} */ (error)));
-    } finally {
-      make.disabled = false;
-    }
-  }
-
-  /** Show how far a video is until it is whole, and then the video. @param {any} begun */
-  async function show(begun) {
-    make.disabled = true;
-    bar.hidden = false;
-    try {
-      const orbit = await follow(begun, stop, ({ frames, frames_done }) => {
-        bar.max = frames;
-        bar.value = frames_done;
-        state.textContent = `${frames_done} of ${frames} frames are rendered. The server continues if this page is closed.`;
-      }, (error) => place.append(noticeOf(error)));
-      state.textContent = !orbit ? "Stopped." : orbit.state === "failed" ? orbit.problem.detail : "";
-      if (orbit?.state === "succeeded") {
-        play(orbit);
-        await list();
-      }
-    } catch (error) {
-      state.textContent = "";
-      throw error;
-    } finally {
-      make.disabled = false;
-      bar.hidden = true;
-    }
+    await begin({ seconds: Number(length.value), width, height, background, ...(path ? { camera_path: path } : {}) });
   }
 
   /** @param {any} orbit */
@@ -88,31 +67,6 @@ export async function showOrbit(section, { model, address, background }, stage) 
       h("p", {}, h("a", { href: orbit.links.video, download: `${model.name || model.id}-${orbit.request.camera_path ? "path" : "orbit"}.mp4` }, "Save the video")));
   }
 
-  /** List the videos that are kept, and return those that are not whole yet. */
-  async function list() {
-    /** @type {any[]} */
-    const orbits = (await get(`${address}/orbits`)).orbits;
-    kept.replaceChildren(...orbits.filter(({ state }) => state === "succeeded").map((orbit) => {
-      const { width, height, seconds } = orbit.request;
-      const name = `${orbit.request.camera_path ? "camera path" : "circle"}, ${width} x ${height}, ${seconds} seconds, ${bytes(orbit.bytes)}`;
-      return h("li", {},
-        h("button", { type: "button", class: "quiet", onclick: () => play(orbit) }, `Play ${name}`),
-        h("button", { type: "button", class: "quiet", "aria-label": `Delete the video ${name}`, onclick: () => remove(orbit) }, "Delete"));
-    }));
-    return orbits.filter(({ state }) => state === "queued" || state === "running");
-  }
-
-  /** @param {any} orbit */
-  async function remove(orbit) {
-    try {
-      await request("DELETE", orbit.links.self);
-      place.replaceChildren();
-      await list();
-    } catch (error) {
-      place.append(noticeOf(/** @type {Error} */ (error)));
-    }
-  }
-
   section.append(h("h2", { id: "orbit-title" }, "Video"),
     h("p", { class: "muted" }, "A circle is as high and as far away as the photos were taken. A camera path leads through views that you choose."),
     h("div", { class: "row" },
@@ -120,10 +74,5 @@ export async function showOrbit(section, { model, address, background }, stage) 
       h("div", { class: "field" }, h("label", { for: "orbit-size" }, "Size"), size),
       h("div", { class: "field" }, h("label", { for: "orbit-length" }, "Length, in seconds"), length)),
     h("div", { class: "row" }, make, stop), bar, state, place, kept);
-  try {
-    const [unfinished] = await list();
-    if (unfinished) await show(unfinished);
-  } catch (error) {
-    place.append(noticeOf(/** @type {Error} */ (error)));
-  }
+  await open();
 }
