@@ -177,7 +177,7 @@ def error_for(problem: Problem, retry_after: float | None = None) -> Refused:
 
 
 def valid_request(kind: type[M], values: Any, code: str = "invalid_request") -> M:
-    """Return the message of a kind with these values, or with those of a JSON text in bytes.
+    """Return an instance of the schema's class `kind` with these values, or with those of a JSON text in bytes.
 
     code: of the problem. Raises InvalidRequest, with one clause per value that the schema rejects.
     """

@@ -305,3 +305,11 @@ def test_the_command_shows_what_is_done_and_an_interrupt_cancels_the_mesh(
     assert not (tmp_path / "never.glb").exists()
     refused = invoke("mesh", MODEL, "--up", "z", *server)
     assert "is for a model file" in " ".join(refused.output.replace("│", " ").split())
+
+
+def test_meshes_of_no_model_and_without_a_renderer_are_refused(app: ServedApp, serve: Serve) -> None:
+    problem(app.http.post("/v1/models/0123456789abcdef/meshes", json=WISH), 404, "model_not_found")
+    problem(app.http.get(f"{MESHES}/0123456789abcdef"), 404, "mesh_not_found")
+    without = serve(storage=app.settings.storage)
+    problem(without.http.post(MESHES, json=WISH), 503, "renderer_unavailable")
+    assert KEPT.marks(app) == []

@@ -68,7 +68,6 @@ NAMED: dict[str, dict[str, Forced]] = {
     "max_gaussians": _by_option("max_gaussians", 60, 2000),
     "max_memory": _by_option("max_memory", None, 300_000_000),
     "sh_degree": _by_option("sh_degree", 0, 1, 2, 3),
-    "photo_statistics": _by_plan("photo_statistics", kept=10**6, computed=None),
     "schedule.resolution": _by_plan(
         "schedule.resolution", reduced=((0, 4), (2, 2), (5, 1)), full=((0, 1),), always=((0, 2),)
     ),

@@ -18,6 +18,7 @@ from splatmill_worker.pipeline.planning import Revise, plan_training, planned_ph
 from splatmill_worker.pipeline.stage_times import Stages
 from splatmill_worker.pipeline.training import train_scene
 from splatmill_worker.splat.engine.open import open_engine
+from splatmill_worker.splat.plan.photos import statistics_memory
 from splatmill_worker.splat.train.loop import Trained
 
 
@@ -79,7 +80,7 @@ def run(
         plan = planned.plan
         first = seeded(planned.first, cameras, photos, plan)
         engine = open_engine(
-            first, plan.kernels, clustered=plan.cluster_culling, most_kept=plan.photo_statistics or 0
+            first, plan.kernels, clustered=plan.cluster_culling, most_kept=statistics_memory(plan.max_memory)
         )
         trained, record = train_scene(job, cameras, photos, plan, engine)
     except Cancelled:

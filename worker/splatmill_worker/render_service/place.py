@@ -23,9 +23,8 @@ def place_beside(model: Path) -> Float | None:
         return None
     if frame.origin is None or frame.unit != "metre":
         return None
-    from splatmill_worker.sfm.world.geodesy import (
-        to_earth_centered,
-    )  # loads COLMAP, which no other model needs
+    # It loads COLMAP, which models without a place do not need.
+    from splatmill_worker.sfm.world.geodesy import to_earth_centered
 
     place = np.array([frame.origin.latitude, frame.origin.longitude, frame.origin.altitude or 0.0])
     return to_earth_centered(place) if np.isfinite(place).all() else None

@@ -23,7 +23,7 @@ from splatmill_worker.pipeline.stage_times import Stages
 from splatmill_worker.pipeline.training import train_scene
 from splatmill_worker.splat.engine.open import open_engine
 from splatmill_worker.splat.plan.capacity import resolved
-from splatmill_worker.splat.plan.photos import loading_size
+from splatmill_worker.splat.plan.photos import loading_size, statistics_memory
 from splatmill_worker.splat.plan.plan import Kernels, Plan
 from splatmill_worker.tiles import coarse_model, joined
 from splatmill_worker.tiles.cells import divide
@@ -145,7 +145,7 @@ def _coarse(context: Context, stages: Stages) -> dict[str, Any]:
         seeded(planned.first, cameras, photos, decided),
         decided.kernels,
         clustered=decided.cluster_culling,
-        most_kept=decided.photo_statistics or 0,
+        most_kept=statistics_memory(decided.max_memory),
     )
     # LPIPS is measured of the whole scene.
     trained, _ = train_scene(job, cameras, photos, replace(decided, lpips=False), engine)

@@ -26,7 +26,7 @@ from splatmill_worker.scene import View
 from splatmill_worker.sfm.callbacks import stop_if
 from splatmill_worker.splat.engine.open import open_engine
 from splatmill_worker.splat.gaussians import Gaussians
-from splatmill_worker.splat.plan.photos import BYTES_PER_PIXEL, fit_in_memory
+from splatmill_worker.splat.plan.photos import BYTES_PER_PIXEL, fit_in_memory, statistics_memory
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.train.loop import Hooks, train
 from splatmill_worker.splat.train.observers import TrainingProgress
@@ -91,7 +91,7 @@ def train_tile(tile: Tile, stages: Stages) -> TileResult:
         plan.kernels,
         clustered=plan.cluster_culling,
         context=whole.select(~free),
-        most_kept=plan.photo_statistics or 0,
+        most_kept=statistics_memory(plan.max_memory),
     )
 
     def progress(progress: TrainingProgress) -> None:

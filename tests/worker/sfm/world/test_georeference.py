@@ -34,6 +34,15 @@ def test_metres_of_a_degree() -> None:
     )
 
 
+def test_the_equator_and_a_pole_lie_an_axis_from_the_centre() -> None:
+    """WGS 84: the semi-axes are 6,378,137 and 6,356,752.3142 m."""
+    equator, pole = (
+        geodesy.to_earth_centered(np.array(place)) for place in ([0.0, 0.0, 0.0], [90.0, 0.0, 10.0])
+    )
+    np.testing.assert_allclose(equator @ [1, 2, 3, 1], [6378137 + 3, 1, 2, 1], atol=1e-6)
+    np.testing.assert_allclose(pole[:3, 3], [0, 0, 6356752.3142 + 10], atol=1e-4)
+
+
 def test_the_poles_and_the_date_line_are_places_too() -> None:
     for origin in ([89.99, 179.9999, 0.0], [-45.0, -179.9999, 100.0], [0.0, 180.0, -5.0]):
         base = np.array(origin)

@@ -5,11 +5,13 @@ Does not prove that a run keeps to its time; tests/worker/splat/train does.
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from splatmill_worker.splat.plan.budget import Budget
 from splatmill_worker.splat.plan.facts import Speed
-from splatmill_worker.splat.plan.plan import BYTES_PER_GAUSSIAN, Plan
+from splatmill_worker.splat.plan.plan import Plan
 from tests.support.plans.facts import changed, planned
 
 
@@ -119,33 +121,26 @@ def test_the_photos_limit_the_gaussians_whatever_the_budget() -> None:
 
 def test_memory_bounds_the_gaussians() -> None:
     plan = planned(max_memory=400_000_000, steps=30_000)
-    assert plan.max_gaussians == Plan.gaussians_within(400_000_000) < planned(steps=30_000).max_gaussians
+    assert (
+        plan.max_gaussians
+        == Plan.gaussians_within(400_000_000, best=False)
+        < planned(steps=30_000).max_gaussians
+    )
     assert "Memory" in plan.reasons["max_gaussians"]
     assert Plan.gaussians_within(0) == 1000
     # What recovering the cameras of many photos leaves behind is no room for Gaussians, nor what training keeps of
-    # the photos, but half of it all is.
-    for used, on_disk, left in (
-        (0, True, 3000 - 350),
-        (0, False, 3000 - 400),
-        (1010, True, 3000 - 1100),
-        (1010, False, 3000 - 1500),
-        (2900, True, 1500),
-    ):
-        large = changed(memory_used=used * 10**6, views=900, photos_on_disk=on_disk)
-        after = planned(large, max_memory=3 * 10**9, steps=30_000)
-        assert after.max_gaussians == left * 10**6 // BYTES_PER_GAUSSIAN
-        assert ("that the process has" in after.reasons["max_gaussians"]) == (used > 0)
-
-
-def test_what_the_loss_needs_of_photos_alone_is_kept_where_memory_holds_the_photos() -> None:
-    few = planned()
-    assert few.photo_statistics == 28 * 43 * 270 * 480
-    assert "156.0 MB" in few.reasons["photo_statistics"]
-    many = planned(changed(views=900))
-    assert many.photo_statistics == 400 * 10**6
-    in_files = planned(changed(views=900, photos_on_disk=True))
-    assert in_files.photo_statistics is None
-    assert "lie in files" in in_files.left_out["photo_statistics"]
+    # the photos, but half of it all is. The best snapshot is kept where the photos may end the training.
+    cases: tuple[tuple[int, dict[str, Any], float], ...] = (
+        (0, {"steps": 30_000}, (3000 - 400) / (59 * 4 * 15)),
+        (610, {"steps": 30_000}, (3000 - 1000) / (59 * 4 * 15)),
+        (610, {"time_budget": 3600}, (3000 - 1000) / (59 * 4 * 18)),
+        (610, {"steps": 30_000, "target_psnr": 40}, (3000 - 1000) / (59 * 4 * 18)),
+        (2900, {"steps": 30_000}, 1500 / (59 * 4 * 15)),
+    )
+    for used, options, left in cases:
+        after = planned(changed(memory_used=used * 10**6, views=900), max_memory=3 * 10**9, **options)
+        assert after.max_gaussians == int(left * 10**6)
+        assert ("of the process and 375.0 MB" in after.reasons["max_gaussians"]) == (used > 0)
 
 
 def test_more_gaussians_asked_for_never_cut_those_at_the_start() -> None:

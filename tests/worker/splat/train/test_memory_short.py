@@ -58,11 +58,15 @@ def test_memory_that_never_suffices_is_a_named_failure() -> None:
     assert raised.value.name is FailureName.memory
 
 
-def test_what_is_not_kept_of_photos_is_computed_anew() -> None:
+@pytest.mark.parametrize("photos", [0, 2, 100])
+def test_statistics_of_photos_are_kept_up_to_a_limit_and_change_no_result(photos: int) -> None:
     views = still_life.training_views()
-    kept, computed = (
-        train(CpuEngine(gaussians_of(first_engine()), most_kept=most), views[1:], [], plan(60), extent=1.1)
-        for most in (10**9, 0)
-    )
-    for one, other in zip(kept.gaussians, computed.gaussians, strict=True):
+    of_one = 28 * views[0].full.rgb[..., 0].numel()
+    engine = CpuEngine(gaussians_of(first_engine()), most_kept=of_one * photos)
+    limited = train(engine, views, [], plan(60), extent=1.1)
+    whole_engine = CpuEngine(gaussians_of(first_engine()))
+    whole = train(whole_engine, views, [], plan(60), extent=1.1)
+    kept = sum(28 * stats.used.numel() for stats in engine._kept.values())
+    assert of_one * (photos - 1) < kept <= of_one * photos or engine._kept.keys() == whole_engine._kept.keys()
+    for one, other in zip(limited.gaussians, whole.gaussians, strict=True):
         assert torch.equal(one, other)

@@ -31,6 +31,6 @@ def local(places: Float, origin: Float) -> Float:
 
 
 def place(offset: Float, origin: Float) -> Float:
-    """The place [3] that `local` puts at `offset` [3]. Millimetres are exact."""
+    """The place [3] that `local` puts at `offset` [3], to a millimetre but within metres of a pole."""
     there: Float = _EARTH.enu_to_ellipsoid(offset[None], *origin)[0]
     return there

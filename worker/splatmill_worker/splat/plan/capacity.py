@@ -22,7 +22,7 @@ from splatmill_worker.splat.plan.deadline import training_seconds
 from splatmill_worker.splat.plan.facts import Facts, Speed
 from splatmill_worker.splat.plan.in_view import share_in_view
 from splatmill_worker.splat.plan.needs import HALF_TURN
-from splatmill_worker.splat.plan.photos import decide_statistics, least_gain
+from splatmill_worker.splat.plan.photos import least_gain, statistics_memory
 from splatmill_worker.splat.plan.plan import Kernels, Plan
 from splatmill_worker.splat.plan.reasons import Decision, by_option, switch
 from splatmill_worker.splat.plan.schedule import MOST_VISITS
@@ -131,12 +131,15 @@ def _max_gaussians(
         photo_bytes = round(3 * pixels * (facts.views + facts.held_out))
         by_memory = largest_budget(options.max_memory or facts.memory_available, round(pixels), photo_bytes)
     else:
-        by_memory = _within(facts, options, decide_statistics(facts, kernels, pixels).value or 0)
+        by_memory = _within(facts, options)
     most = min(max(by_photos, initial), by_memory)
     if options.max_gaussians is not None and options.max_gaussians <= most:
         return by_option(options.max_gaussians)
     counts = options.max_memory is not None and kernels != "gpu" and facts.memory_used > 0
-    beside = f" beside the {format_bytes(facts.memory_used)} that the process has already" if counts else ""
+    beside = ""
+    if counts:
+        kept = format_bytes(statistics_memory(options.max_memory))
+        beside = f" beside the {format_bytes(facts.memory_used)} of the process and {kept} for statistics of the photos"
     because = {
         by_photos: f"{facts.views} photos of {round(pixels)} pixels resolve {by_photos} Gaussians. Training makes as "
         "many of them as the detail of the scene asks for.",
@@ -147,14 +150,17 @@ def _max_gaussians(
     )
 
 
-def _within(facts: Facts, options: TrainOptions, kept: int) -> int:
-    """Gaussians that memory holds: half of what is free, or `max_memory` less what the process has, and `kept` bytes
-    that it will keep of the photos, of which half at least is for Gaussians. These are rounded, so that the same
-    command has the same limit."""
+def _within(facts: Facts, options: TrainOptions) -> int:
+    """Gaussians that memory holds: in half of what is free, or in what `max_memory` leaves beside the process and the
+    statistics of the photos, but in half of it at least. What is beside them is rounded, so that the same command has
+    the same limit.
+    """
     if options.max_memory is None:
         return Plan.gaussians_within(facts.memory_available // 2)
-    used = math.ceil((facts.memory_used + kept) / ROUNDED) * ROUNDED
-    return Plan.gaussians_within(options.max_memory, min(used, options.max_memory // 2))
+    beside = facts.memory_used + statistics_memory(options.max_memory)
+    rounded = min(math.ceil(beside / ROUNDED) * ROUNDED, options.max_memory // 2)
+    best = options.steps is None or options.target_psnr is not None
+    return Plan.gaussians_within(options.max_memory, rounded, best=best)
 
 
 def _budget(

@@ -18,7 +18,6 @@ from splatmill_worker.splat.plan.photos import (
     decide_exposure,
     decide_image_size,
     decide_photos_on_disk,
-    decide_statistics,
     decide_validation,
     least_gain,
     undistortion,
@@ -49,8 +48,7 @@ def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
     start, gaussians = _start(facts)
     needs = needs_of(facts, options, kernels, scale=scale)
     initial = gaussians + (needs.added if start.value == "points" else 0)
-    pixels = facts.pixels * scale**2
-    capacity = decide_capacity(facts, options, kernels, initial=initial, pixels=pixels)
+    capacity = decide_capacity(facts, options, kernels, initial=initial, pixels=facts.pixels * scale**2)
     most, steps = capacity.max_gaussians.value, capacity.steps.value
     if facts.hull_points is not None and start.value == "hull":
         added = at_first(facts.hull_points, most)
@@ -59,7 +57,6 @@ def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
     decisions: dict[str, Decision[Any]] = {
         "image_size": image_size,
         "photos_on_disk": decide_photos_on_disk(facts),
-        "photo_statistics": (statistics := decide_statistics(facts, kernels, pixels)),
         "initial": start,
         "far_shell": needs.far_shell,
         "gaps": needs.gaps,
@@ -122,7 +119,6 @@ def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
         gaps=needs.gaps.value,
         pose_refinement=needs.pose_refinement.value,
         cluster_culling=culling.value,
-        photo_statistics=statistics.value,
         validation=validation.value,
         least_gain=gain or 0.0,
         lpips=lpips.value,

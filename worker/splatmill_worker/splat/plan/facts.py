@@ -14,7 +14,6 @@ import torch
 from splatmill_worker import memory
 from splatmill_worker.images.lens import distortion
 from splatmill_worker.scene import Scene
-from splatmill_worker.splat.machine import resident_memory
 from splatmill_worker.splat.plan.light import Light, compared
 from splatmill_worker.splat.plan.observations import MAX_POINTS, Observations
 from splatmill_worker.splat.start.cells import cells_of
@@ -29,6 +28,9 @@ Float = npt.NDArray[np.float64]
 
 SOME_VIEWS = 50
 """Photos, evenly chosen, that are enough for the median of what photos have in view."""
+
+LIBRARIES = 200 * 10**6
+"""Resident pages of the files of COLMAP, torch and the other libraries, bytes."""
 
 
 @dataclass(frozen=True)
@@ -102,8 +104,8 @@ class Facts:
     halving_loss: median RMS difference between a photo and its half-size copy enlarged again, grey levels of 255.
     reprojection: median reprojection error, pixels; without stereo points.
     memory_available: memory that this process can still use, or free memory of the GPU for the gpu kernels, bytes.
-    memory_used: memory of this process when the plan is made, bytes: the program and its libraries, what recovering
-        the cameras leaves behind, and photos that are not in files.
+    memory_used: memory of this process when the plan is made, bytes: libraries, what recovering the cameras leaves
+        behind, and photos that are not in files.
     light: exposure and white balance of the photos; None where too few show the same points.
     geometry: None where it is not known which photos show which points.
     coverage: None without enough points, or where photos are transparent.
@@ -210,8 +212,8 @@ def measure(scene: Scene, views: Sequence[TrainingView], held_out: int, speed: S
         no_points=scene.facts.get("no_points"),
     )
     del seen
-    memory.return_freed()  # of many photos, some hundred megabytes that training would not get
-    return replace(facts, memory_available=memory.available(), memory_used=resident_memory())
+    memory.return_freed()  # what was compared of many photos has left hundreds of megabytes of free pieces
+    return replace(facts, memory_available=memory.available(), memory_used=memory.used() + LIBRARIES)
 
 
 def halving_loss(rgb: torch.Tensor) -> float:

@@ -13,7 +13,6 @@ from splatmill.schema import (
     TrainOptions,
     format_bytes,
 )
-from splatmill_worker.kernels.cpu.loss import BYTES_PER_PIXEL as STATISTICS_PER_PIXEL
 from splatmill_worker.splat.engine.cpu import MOST_KEPT
 from splatmill_worker.splat.plan.facts import Facts
 from splatmill_worker.splat.plan.needs import FEW_VIEWS
@@ -50,7 +49,8 @@ MOST_VALIDATION = 8
 set aside under a budget as well (decisions: best-validated)."""
 
 PHOTO_SHARE = 1 / 8
-"""Share of the memory of a run that photos may take in it (decisions: photos-on-disk)."""
+"""Share of the memory of a run that photos may take in it, and their statistics again (decisions: photos-on-disk,
+photo-statistics)."""
 
 BYTES_PER_PIXEL = 4
 """Of a photo: three colours, and a mask or alpha."""
@@ -69,6 +69,11 @@ def fit_in_memory(photo_bytes: int, memory: int) -> bool:
     return photo_bytes <= PHOTO_SHARE * memory
 
 
+def statistics_memory(max_memory: int | None) -> int:
+    """Bytes of SSIM statistics of photos that training keeps at most, where it may use `max_memory` bytes."""
+    return MOST_KEPT if max_memory is None else min(MOST_KEPT, int(PHOTO_SHARE * max_memory))
+
+
 def decide_photos_on_disk(facts: Facts) -> Decision[bool]:
     """Whether photos lie in files. It was decided by `fit_in_memory` before they were loaded; this says why."""
     if facts.photo_bytes is None:
@@ -80,22 +85,6 @@ def decide_photos_on_disk(facts: Facts) -> Decision[bool]:
         True,
         f"{photos}, more than an eighth of the memory. So they lie decoded in files, and steps read them ahead.",
     )
-
-
-def decide_statistics(facts: Facts, kernels: Kernels, pixels: float) -> Decision[int | None]:
-    """Memory for what the loss needs of each photo of `pixels` pixels alone; None: it is computed at every visit
-    (decisions: photo-statistics)."""
-    if kernels != "cpu":
-        return Decision(None, "")
-    size = round(STATISTICS_PER_PIXEL * pixels * facts.views)
-    words = f"What the loss needs of each photo alone takes {format_bytes(size)}"
-    if facts.photos_on_disk:
-        return Decision(None, f"{words}, and the photos lie in files. So it is computed at every visit.")
-    if size > MOST_KEPT:
-        return Decision(
-            MOST_KEPT, f"{words}, of which {format_bytes(MOST_KEPT)} are kept between its visits."
-        )
-    return Decision(size, f"{words}, which is kept between its visits.")
 
 
 def decide_image_size(facts: Facts, options: TrainOptions) -> Decision[int]:

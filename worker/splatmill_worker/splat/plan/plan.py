@@ -11,9 +11,13 @@ from splatmill_worker.splat.plan.schedule import Schedule
 
 Kernels = Literal["reference", "cpu", "gpu"]
 
-BYTES_PER_GAUSSIAN = 59 * 4 * 11
-"""Memory of one Gaussian in training: 59 parameters of 4 bytes, times eleven. That is parameters and two moments, twice
-while they are rewritten, the last good and the best snapshot, and room for the kernels' records."""
+BYTES_PER_GAUSSIAN = 59 * 4 * 15
+"""Memory of one Gaussian in training: 59 parameters of 4 bytes, times fifteen. That is parameters and two moments in
+the engine, in the last good snapshot, and twice while Gaussians are added, and as much for the kernels' records
+(decisions: BYTES_PER_GAUSSIAN)."""
+
+BYTES_OF_BEST = 59 * 4 * 3
+"""The same in the best snapshot, of a training that validation photos may end."""
 
 BYTES_OF_PROGRAM = 350 * 10**6
 """Memory that is assumed for the program and the photos."""
@@ -41,7 +45,6 @@ class Plan:
     gaps: Gaussians are added where photos show something that no point describes.
     pose_refinement: the cameras of training photos are corrected.
     cluster_culling: steps leave out clusters of Gaussians that the photo does not show.
-    photo_statistics: memory for what the loss needs of each photo alone, bytes; None: it is computed at every visit.
     validation: number of training photos that are set aside for `target_psnr` and `stops_when_flat`; None: neither.
     least_gain: dB, for `stops_when_flat`; 0 where training ends only once it over-fits.
     lpips: LPIPS of the held-out photos is measured at the end.
@@ -67,7 +70,6 @@ class Plan:
     gaps: bool = False
     pose_refinement: bool = False
     cluster_culling: bool = False
-    photo_statistics: int | None = None
     validation: int | None = None
     least_gain: float = 0.02
     lpips: bool = False
@@ -93,9 +95,11 @@ class Plan:
         return Plan(**fields)
 
     @staticmethod
-    def gaussians_within(memory: int, used: int = 0) -> int:
+    def gaussians_within(memory: int, used: int = 0, *, best: bool = True) -> int:
         """Number of Gaussians that `memory` bytes hold beside the photos and the program itself; at least 1000.
 
         used: bytes that these are known to have, where that is more than BYTES_OF_PROGRAM.
+        best: whether the best snapshot is kept too.
         """
-        return max(1000, (memory - max(used, BYTES_OF_PROGRAM)) // BYTES_PER_GAUSSIAN)
+        each = BYTES_PER_GAUSSIAN + (BYTES_OF_BEST if best else 0)
+        return max(1000, (memory - max(used, BYTES_OF_PROGRAM)) // each)

@@ -294,7 +294,8 @@ class TrainingRun:
     def _densify(self) -> None:
         allowed = min(self.plan.max_gaussians, self.state.max_gaussians)
         if self.plan.max_memory is not None:
-            allowed = min(allowed, self.plan.gaussians_within(self.plan.max_memory))
+            watched = self.plan.validation is not None
+            allowed = min(allowed, self.plan.gaussians_within(self.plan.max_memory, best=watched))
         within = self.plan.schedule.decay_within
         try:
             densify(
