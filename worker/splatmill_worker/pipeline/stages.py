@@ -80,7 +80,10 @@ def run(
         plan = planned.plan
         first = seeded(planned.first, cameras, photos, plan)
         engine = open_engine(
-            first, plan.kernels, clustered=plan.cluster_culling, most_kept=statistics_memory(plan.max_memory)
+            first,
+            plan.kernels,
+            clustered=plan.cluster_culling,
+            most_kept=statistics_memory(plan.max_memory, photos.size),
         )
         trained, record = train_scene(job, cameras, photos, plan, engine)
     except Cancelled:

@@ -145,7 +145,7 @@ def _coarse(context: Context, stages: Stages) -> dict[str, Any]:
         seeded(planned.first, cameras, photos, decided),
         decided.kernels,
         clustered=decided.cluster_culling,
-        most_kept=statistics_memory(decided.max_memory),
+        most_kept=statistics_memory(decided.max_memory, photos.size),
     )
     # LPIPS is measured of the whole scene.
     trained, _ = train_scene(job, cameras, photos, replace(decided, lpips=False), engine)

@@ -86,12 +86,13 @@ def train_tile(tile: Tile, stages: Stages) -> TileResult:
     if not views or not within.count:
         return TileResult(within, {"gaussians": within.count, "steps": 0, "photos": len(views)})
     plan = tile_plan(coarse, int(free.sum()), len(views))
+    photo_bytes = BYTES_PER_PIXEL * sum(view.full.camera.width * view.full.camera.height for view in views)
     engine = open_engine(
         whole.select(free),
         plan.kernels,
         clustered=plan.cluster_culling,
         context=whole.select(~free),
-        most_kept=statistics_memory(plan.max_memory),
+        most_kept=statistics_memory(plan.max_memory, photo_bytes),
     )
 
     def progress(progress: TrainingProgress) -> None:

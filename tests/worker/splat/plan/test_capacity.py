@@ -11,6 +11,7 @@ import pytest
 
 from splatmill_worker.splat.plan.budget import Budget
 from splatmill_worker.splat.plan.facts import Speed
+from splatmill_worker.splat.plan.photos import statistics_memory
 from splatmill_worker.splat.plan.plan import Plan
 from tests.support.plans.facts import changed, planned
 
@@ -128,19 +129,30 @@ def test_memory_bounds_the_gaussians() -> None:
     )
     assert "Memory" in plan.reasons["max_gaussians"]
     assert Plan.gaussians_within(0) == 1000
-    # What recovering the cameras of many photos leaves behind is no room for Gaussians, nor what training keeps of
-    # the photos, but half of it all is. The best snapshot is kept where the photos may end the training.
+    # What recovering the cameras of many photos leaves behind is no room for Gaussians, nor are the statistics of
+    # photos where memory holds all of them, but half of it all is. The best snapshot is kept where the photos may end
+    # the training.
     cases: tuple[tuple[int, dict[str, Any], float], ...] = (
-        (0, {"steps": 30_000}, (3000 - 400) / (59 * 4 * 15)),
-        (610, {"steps": 30_000}, (3000 - 1000) / (59 * 4 * 15)),
-        (610, {"time_budget": 3600}, (3000 - 1000) / (59 * 4 * 18)),
-        (610, {"steps": 30_000, "target_psnr": 40}, (3000 - 1000) / (59 * 4 * 18)),
+        (0, {"steps": 30_000}, (3000 - 350) / (59 * 4 * 15)),
+        (610, {"steps": 30_000}, (3000 - 700) / (59 * 4 * 15)),
+        (610, {"time_budget": 3600}, (3000 - 700) / (59 * 4 * 18)),
+        (610, {"steps": 30_000, "target_psnr": 40}, (3000 - 700) / (59 * 4 * 18)),
         (2900, {"steps": 30_000}, 1500 / (59 * 4 * 15)),
     )
     for used, options, left in cases:
         after = planned(changed(memory_used=used * 10**6, views=900), max_memory=3 * 10**9, **options)
         assert after.max_gaussians == int(left * 10**6)
-        assert ("of the process and 375.0 MB" in after.reasons["max_gaussians"]) == (used > 0)
+        assert ("MB of the process" in after.reasons["max_gaussians"]) == (0 < used < 1000)
+
+
+def test_statistics_of_all_photos_are_kept_or_of_none() -> None:
+    assert statistics_memory(None, 1e12) == 400 * 10**6
+    assert statistics_memory(8 * 10**9, 400e6 / 9.2) == 400 * 10**6
+    assert statistics_memory(8 * 10**9, 400e6 / 9.1) == 0
+    assert statistics_memory(800 * 10**6, 100e6 / 9.2) == 100 * 10**6
+    few = planned(changed(memory_used=10**9, points=300_000), max_memory=2 * 10**9, steps=30_000)
+    assert few.max_gaussians == 10**9 // (59 * 4 * 15)
+    assert "beside the 1.0 GB of the process and 250.0 MB for statistics" in few.reasons["max_gaussians"]
 
 
 def test_more_gaussians_asked_for_never_cut_those_at_the_start() -> None:

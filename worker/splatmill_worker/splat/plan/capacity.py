@@ -22,7 +22,7 @@ from splatmill_worker.splat.plan.deadline import training_seconds
 from splatmill_worker.splat.plan.facts import Facts, Speed
 from splatmill_worker.splat.plan.in_view import share_in_view
 from splatmill_worker.splat.plan.needs import HALF_TURN
-from splatmill_worker.splat.plan.photos import least_gain, statistics_memory
+from splatmill_worker.splat.plan.photos import BYTES_PER_PIXEL, least_gain, statistics_memory
 from splatmill_worker.splat.plan.plan import Kernels, Plan
 from splatmill_worker.splat.plan.reasons import Decision, by_option, switch
 from splatmill_worker.splat.plan.schedule import MOST_VISITS
@@ -127,19 +127,20 @@ def _max_gaussians(
     all that a plan needs (decisions: PIXELS_PER_GAUSSIAN).
     """
     by_photos = resolved(pixels, facts.views)
+    kept = statistics_memory(options.max_memory, BYTES_PER_PIXEL * pixels * (facts.views + facts.held_out))
     if kernels == "gpu":
         photo_bytes = round(3 * pixels * (facts.views + facts.held_out))
         by_memory = largest_budget(options.max_memory or facts.memory_available, round(pixels), photo_bytes)
     else:
-        by_memory = _within(facts, options)
+        by_memory = _within(facts, options, kept)
     most = min(max(by_photos, initial), by_memory)
     if options.max_gaussians is not None and options.max_gaussians <= most:
         return by_option(options.max_gaussians)
     counts = options.max_memory is not None and kernels != "gpu" and facts.memory_used > 0
     beside = ""
     if counts:
-        kept = format_bytes(statistics_memory(options.max_memory))
-        beside = f" beside the {format_bytes(facts.memory_used)} of the process and {kept} for statistics of the photos"
+        statistics = f" and {format_bytes(kept)} for statistics of the photos" if kept else ""
+        beside = f" beside the {format_bytes(facts.memory_used)} of the process{statistics}"
     because = {
         by_photos: f"{facts.views} photos of {round(pixels)} pixels resolve {by_photos} Gaussians. Training makes as "
         "many of them as the detail of the scene asks for.",
@@ -150,14 +151,14 @@ def _max_gaussians(
     )
 
 
-def _within(facts: Facts, options: TrainOptions) -> int:
+def _within(facts: Facts, options: TrainOptions, kept: int) -> int:
     """Gaussians that memory holds: in half of what is free, or in what `max_memory` leaves beside the process and the
-    statistics of the photos, but in half of it at least. What is beside them is rounded, so that the same command has
-    the same limit.
+    `kept` bytes of statistics of the photos, but in half of it at least. What is beside them is rounded, so that the
+    same command has the same limit.
     """
     if options.max_memory is None:
         return Plan.gaussians_within(facts.memory_available // 2)
-    beside = facts.memory_used + statistics_memory(options.max_memory)
+    beside = facts.memory_used + kept
     rounded = min(math.ceil(beside / ROUNDED) * ROUNDED, options.max_memory // 2)
     best = options.steps is None or options.target_psnr is not None
     return Plan.gaussians_within(options.max_memory, rounded, best=best)

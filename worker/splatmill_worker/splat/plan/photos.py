@@ -55,6 +55,9 @@ photo-statistics)."""
 BYTES_PER_PIXEL = 4
 """Of a photo: three colours, and a mask or alpha."""
 
+STATISTICS_OVER_PHOTO = 28 / BYTES_PER_PIXEL * (1 + 1 / 4 + 1 / 16)
+"""Size of the SSIM statistics of a photo and of its two reduced copies, over that of the photo."""
+
 DISTANCES_DIFFER = 4.0
 """Ratio of the distances from which the same point is seen, above which Gaussians are anti-aliased."""
 
@@ -69,9 +72,16 @@ def fit_in_memory(photo_bytes: int, memory: int) -> bool:
     return photo_bytes <= PHOTO_SHARE * memory
 
 
-def statistics_memory(max_memory: int | None) -> int:
-    """Bytes of SSIM statistics of photos that training keeps at most, where it may use `max_memory` bytes."""
-    return MOST_KEPT if max_memory is None else min(MOST_KEPT, int(PHOTO_SHARE * max_memory))
+def statistics_memory(max_memory: int | None, photo_bytes: float) -> int:
+    """Bytes of SSIM statistics that training keeps at most, of photos of so many bytes in all.
+
+    Where it may use `max_memory` bytes alone, it keeps those of all photos or of none: each comes once in a round, so
+    that those of a few are used seldom.
+    """
+    if max_memory is None:
+        return MOST_KEPT
+    most = min(MOST_KEPT, int(PHOTO_SHARE * max_memory))
+    return most if STATISTICS_OVER_PHOTO * photo_bytes <= most else 0
 
 
 def decide_photos_on_disk(facts: Facts) -> Decision[bool]:
