@@ -133,11 +133,11 @@ def test_memory_bounds_the_gaussians() -> None:
     # photos where memory holds all of them, but half of it all is. The best snapshot is kept where the photos may end
     # the training.
     cases: tuple[tuple[int, dict[str, Any], float], ...] = (
-        (0, {"steps": 30_000}, (3000 - 350) / (59 * 4 * 15)),
-        (610, {"steps": 30_000}, (3000 - 700) / (59 * 4 * 15)),
-        (610, {"time_budget": 3600}, (3000 - 700) / (59 * 4 * 18)),
-        (610, {"steps": 30_000, "target_psnr": 40}, (3000 - 700) / (59 * 4 * 18)),
-        (2900, {"steps": 30_000}, 1500 / (59 * 4 * 15)),
+        (0, {"steps": 30_000}, (3000 - 350) / (59 * 4 * 16)),
+        (610, {"steps": 30_000}, (3000 - 700) / (59 * 4 * 16)),
+        (610, {"time_budget": 3600}, (3000 - 700) / (59 * 4 * 19)),
+        (610, {"steps": 30_000, "target_psnr": 40}, (3000 - 700) / (59 * 4 * 19)),
+        (2900, {"steps": 30_000}, 1500 / (59 * 4 * 16)),
     )
     for used, options, left in cases:
         after = planned(changed(memory_used=used * 10**6, views=900), max_memory=3 * 10**9, **options)
@@ -151,7 +151,7 @@ def test_statistics_of_all_photos_are_kept_or_of_none() -> None:
     assert statistics_memory(8 * 10**9, 400e6 / 9.1) == 0
     assert statistics_memory(800 * 10**6, 100e6 / 9.2) == 100 * 10**6
     few = planned(changed(memory_used=10**9, points=300_000), max_memory=2 * 10**9, steps=30_000)
-    assert few.max_gaussians == 10**9 // (59 * 4 * 15)
+    assert few.max_gaussians == 10**9 // (59 * 4 * 16)
     assert "beside the 1.0 GB of the process and 250.0 MB for statistics" in few.reasons["max_gaussians"]
 
 

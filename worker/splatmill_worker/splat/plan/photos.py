@@ -49,8 +49,7 @@ MOST_VALIDATION = 8
 set aside under a budget as well (decisions: best-validated)."""
 
 PHOTO_SHARE = 1 / 8
-"""Share of the memory of a run that photos may take in it, and their statistics again (decisions: photos-on-disk,
-photo-statistics)."""
+"""Share of the memory of a run that photos may take in it, and their statistics again (decisions: photos-on-disk)."""
 
 BYTES_PER_PIXEL = 4
 """Of a photo: three colours, and a mask or alpha."""
@@ -75,8 +74,8 @@ def fit_in_memory(photo_bytes: int, memory: int) -> bool:
 def statistics_memory(max_memory: int | None, photo_bytes: float) -> int:
     """Bytes of SSIM statistics that training keeps at most, of photos of so many bytes in all.
 
-    Where it may use `max_memory` bytes alone, it keeps those of all photos or of none: each comes once in a round, so
-    that those of a few are used seldom.
+    Under a limit of `max_memory` bytes for all, it keeps those of all photos or of none: each photo comes once in a
+    round, so that those of a few are used seldom (decisions: photo-statistics).
     """
     if max_memory is None:
         return MOST_KEPT

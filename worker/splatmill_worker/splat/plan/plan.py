@@ -11,9 +11,9 @@ from splatmill_worker.splat.plan.schedule import Schedule
 
 Kernels = Literal["reference", "cpu", "gpu"]
 
-BYTES_PER_GAUSSIAN = 59 * 4 * 15
-"""Memory of one Gaussian in training: 59 parameters of 4 bytes, times fifteen. That is parameters and two moments in
-the engine, in the last good snapshot, and twice while Gaussians are added, and as much for the kernels' records
+BYTES_PER_GAUSSIAN = 59 * 4 * 16
+"""Memory of one Gaussian in training: 59 parameters of 4 bytes, times sixteen. That is parameters and two moments in
+the engine, in the last good snapshot, and twice while Gaussians are added, and a third of that for the kernels' records
 (decisions: BYTES_PER_GAUSSIAN)."""
 
 BYTES_OF_BEST = 59 * 4 * 3
