@@ -64,6 +64,8 @@ def test_each_photo_that_is_placed_and_each_adjustment_is_reported(reports: dict
     steps = [done for done, _, note in reports["mapping"] if note == "photos placed"]
     assert set(steps) >= set(range(3, placed + 1))
     assert steps == sorted(steps)
+    colors = [note for _, _, note in reports["mapping"] if note.startswith("colours ")]
+    assert colors == [f"colours of the points, from {n} of {placed} photos" for n in range(1, placed + 1)]
     adjustments = [note for _, _, note in reports["mapping"] if note.startswith("adjusting ")]
     assert f"adjusting {max(steps)} cameras, pass 1" in adjustments
     assert adjustments[-1].startswith(f"adjusting {placed} cameras and their lenses, iteration ")

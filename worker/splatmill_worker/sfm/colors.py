@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -16,13 +17,20 @@ SIDE = 320
 """Pixels of the longest side to which a photo is reduced at most: each pixel is then the mean of a small area."""
 
 
-def color_points(model: pycolmap.Reconstruction, views: dict[int, View], pool: ThreadPoolExecutor) -> None:
+def color_points(
+    model: pycolmap.Reconstruction,
+    views: dict[int, View],
+    pool: ThreadPoolExecutor,
+    on_photo: Callable[[int], None],
+) -> None:
     """Set the colour of each point to the mean over the photos that observe it, in place.
 
-    views: by COLMAP's image id.
+    views: by COLMAP's image id. on_photo: called with the number of photos that were read, after each.
     """
     sums: dict[int, npt.NDArray[np.float64]] = {}
-    for point_ids, colors in pool.map(lambda item: _observed(model, *item), views.items()):
+    observed = pool.map(lambda item: _observed(model, *item), views.items())
+    for done, (point_ids, colors) in enumerate(observed, 1):
+        on_photo(done)
         for point_id, color in zip(point_ids, colors, strict=True):
             entry = sums.setdefault(point_id, np.zeros(4))  # red, green, blue, and the number of photos
             entry[:3] += color

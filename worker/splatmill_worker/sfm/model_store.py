@@ -16,6 +16,7 @@ from splatmill_worker.images.panoramas import faces
 from splatmill_worker.images.prepare import Prepared
 from splatmill_worker.scene import Scene, View
 from splatmill_worker.sfm import features, stereo
+from splatmill_worker.sfm.callbacks import stop_if
 from splatmill_worker.sfm.colors import color_points
 from splatmill_worker.sfm.final_model import FinalModel
 from splatmill_worker.sfm.posed.colmap_model import posed_view, scene_of
@@ -37,10 +38,20 @@ def is_stored(folder: Path) -> bool:
 
 
 def store_model(run: SfmRun, final: FinalModel, folder: Path) -> None:
-    """Colour the points, add stereo points where there are few, and store all of it in `folder`, atomically."""
+    """Colour the points, add stereo points where there are few, and store all of it in `folder`, atomically.
+
+    Raises Cancelled between two photos.
+    """
     with run.clock("colors"):
         views = _views(run.prepared, final.model)
-        color_points(final.model, views, run.pool)
+
+        def report(done: int) -> None:
+            stop_if(run.cancelled)
+            run.on_mapping(
+                len(views), run.count, f"colours of the points, from {done} of {len(views)} photos"
+            )
+
+        color_points(final.model, views, run.pool, report)
     partial = folder.with_name(f"{folder.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
