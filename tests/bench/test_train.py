@@ -509,3 +509,15 @@ def test_the_official_protocol_trains_its_own_scene_alone(
     with pytest.raises(SystemExit):
         run(place, "--official")
     assert "leave out --scenes, --configs and --peer" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["lund", "kermit", "beer", "snowmiku"])
+def test_a_scene_whose_cameras_are_recovered_brings_none(parts: Any, tmp_path: Path, name: str) -> None:
+    try:
+        scene = parts["_train.scenes"].named(name, tmp_path)
+    except FileNotFoundError as error:
+        pytest.skip(str(error))
+    assert not scene.posed
+    names = {path.name for path in scene.folder.rglob("*")}
+    assert "images" in names
+    assert not names & {"transforms.json", "cameras.bin", "cameras.txt"}

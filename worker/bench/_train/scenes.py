@@ -83,7 +83,7 @@ def named(text: str, work: Path) -> Scene:
             raise FileNotFoundError(
                 f"{text} is left out: {shared} is not in ../shared/data, and no part of the project."
             )
-        if text == "beer":
+        if text in ("beer", "snowmiku"):
             return Scene(text, _photos_alone(folder, work / text / "capture"))
         if text in ("lego", OFFICIAL):
             lego = {"image_size": 800 if text == OFFICIAL else 400, "holdout": 8}
