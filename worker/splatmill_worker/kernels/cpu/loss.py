@@ -10,8 +10,8 @@ from torch import Tensor
 from splatmill_worker.kernels import cpu
 from splatmill_worker.kernels.records import TILE
 
-BYTES_PER_PIXEL = 28
-"""Memory of the statistics of a photo, for each of its pixels."""
+STATISTICS_PER_PIXEL = 28
+"""Bytes of the statistics of a photo, for each of its pixels."""
 
 
 class PhotoStats(NamedTuple):
@@ -36,7 +36,7 @@ class PhotoStats(NamedTuple):
 def photo_stats(photo: Tensor, *, mask: Tensor | None = None) -> PhotoStats:
     """Return the planes and SSIM statistics of a photo (uint8 [H,W,3]) under a mask ([H,W], nonzero where used).
 
-    They take BYTES_PER_PIXEL. The mask is uint8 or bool.
+    They take STATISTICS_PER_PIXEL. The mask is uint8 or bool.
     """
     height, width = photo.shape[:2]
     stride = whole_tiles(width)

@@ -6,7 +6,7 @@ from collections.abc import Hashable
 
 from torch import Tensor
 
-from splatmill_worker.kernels.cpu.loss import BYTES_PER_PIXEL, PhotoStats, photo_stats
+from splatmill_worker.kernels.cpu.loss import STATISTICS_PER_PIXEL, PhotoStats, photo_stats
 from splatmill_worker.kernels.cpu.step import Step
 from splatmill_worker.kernels.records import Rates
 from splatmill_worker.splat.engine.protocol import StepResult
@@ -92,7 +92,7 @@ class CpuEngine(Step):
         if key is not None and key in self._kept:
             return self._kept[key]
         stats = photo_stats(photo, mask=mask)
-        size = BYTES_PER_PIXEL * stats.used.numel()
+        size = STATISTICS_PER_PIXEL * stats.used.numel()
         if key is not None and self._kept_bytes + size <= self._most_kept:
             self._kept[key] = stats
             self._kept_bytes += size

@@ -21,7 +21,7 @@ def open_engine(
 
     clustered: steps leave out clusters of Gaussians that are not in view; for cpu alone.
     context: Gaussians that are rendered with the others, and that nothing moves; not for gpu.
-    most_kept: memory of the cpu engine for what the loss needs of each photo alone, bytes.
+    most_kept: as in `CpuEngine`; the others keep nothing of photos.
 
     Raises ValueError for what the backend does not do.
     """

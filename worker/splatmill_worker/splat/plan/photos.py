@@ -13,6 +13,7 @@ from splatmill.schema import (
     TrainOptions,
     format_bytes,
 )
+from splatmill_worker.kernels.cpu.loss import STATISTICS_PER_PIXEL
 from splatmill_worker.splat.engine.cpu import MOST_KEPT
 from splatmill_worker.splat.plan.facts import Facts
 from splatmill_worker.splat.plan.needs import FEW_VIEWS
@@ -54,7 +55,7 @@ PHOTO_SHARE = 1 / 8
 BYTES_PER_PIXEL = 4
 """Of a photo: three colours, and a mask or alpha."""
 
-STATISTICS_OVER_PHOTO = 28 / BYTES_PER_PIXEL * (1 + 1 / 4 + 1 / 16)
+STATISTICS_OVER_PHOTO = STATISTICS_PER_PIXEL / BYTES_PER_PIXEL * (1 + 1 / 4 + 1 / 16)
 """Size of the SSIM statistics of a photo and of its two reduced copies, over that of the photo."""
 
 DISTANCES_DIFFER = 4.0
