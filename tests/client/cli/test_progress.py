@@ -3,6 +3,8 @@
 Does not prove how the moving line on a terminal looks.
 """
 
+import time
+
 import pytest
 
 from splatmill.cli.display import progress as cli
@@ -27,13 +29,25 @@ def test_many_steps_are_few_lines_and_the_last_is_never_lost(capsys: pytest.Capt
     assert len(lines) < 20
 
 
-def test_a_stage_is_told_at_once_and_again_after_a_while(capsys, monkeypatch):
-    monkeypatch.setattr(cli, "PLAIN_INTERVAL", 0.0)
-    with cli.PlainDisplay() as display:
+def test_a_stage_is_told_at_once_and_again_after_a_while(capsys: pytest.CaptureFixture[str]):
+    with cli.PlainDisplay(interval=0.0) as display:
         for n in range(4):
             display.progress(step(n))
             display.progress(step(n))
     assert len(capsys.readouterr().out.splitlines()) == 4  # the same progress is not printed again
+
+
+def test_the_last_progress_before_a_pause_is_printed_during_it(capsys: pytest.CaptureFixture[str]):
+    with cli.PlainDisplay(interval=0.2) as display:
+        for n in range(1, 5):
+            display.progress(step(n))
+        lines = capsys.readouterr().out.splitlines()
+        began = time.monotonic()
+        while len(lines) < 2 and time.monotonic() < began + 30.0:
+            time.sleep(0.02)
+            lines += capsys.readouterr().out.splitlines()
+        assert lines == ["training  1/1000", "training  4/1000"]
+    assert capsys.readouterr().out == ""
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """Display of the progress of a job: a progress bar on a terminal, plain lines elsewhere."""
 
 import sys
+import threading
 import time
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Protocol, Self
@@ -77,36 +78,57 @@ class Display(Protocol):
 
 
 class PlainDisplay:
-    """Prints lines to standard output, at most one every few seconds about one stage, none twice in a row."""
+    """Prints lines to standard output, at most one every `interval` seconds about one stage, none twice in a row.
 
-    def __init__(self) -> None:
+    Progress that came too soon after the line before is printed once the interval is over, if no other has come.
+    """
+
+    def __init__(self, interval: float = PLAIN_INTERVAL) -> None:
+        self._interval = interval
         self._stage = ""
         self._next = 0.0
         self._last = ""
         self._held_back: Progress | None = None
+        self._timer = threading.Timer(0.0, self._late)
+        self._lock = threading.Lock()
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._flush()
+        with self._lock:
+            self._flush()
 
     def progress(self, progress: Progress) -> None:
-        now = time.monotonic()
-        if progress.stage != self._stage:
-            self._flush()
-        elif now < self._next:
-            self._held_back = progress
-            return
-        self._stage, self._next, self._held_back = progress.stage, now + PLAIN_INTERVAL, None
-        self._show(progress_text(progress))
+        with self._lock:
+            now = time.monotonic()
+            if progress.stage != self._stage:
+                self._flush()
+            elif now < self._next:
+                if self._held_back is None:
+                    self._timer = threading.Timer(self._next - now, self._late)
+                    self._timer.daemon = True
+                    self._timer.start()
+                self._held_back = progress
+                return
+            self._timer.cancel()
+            self._stage, self._next, self._held_back = progress.stage, now + self._interval, None
+            self._show(progress_text(progress))
 
     def print(self, line: str) -> None:
-        self._flush()
-        print(line, flush=True)
+        with self._lock:
+            self._flush()
+            print(line, flush=True)
+
+    def _late(self) -> None:
+        """Print the progress that was held back, now that the interval is over."""
+        with self._lock:
+            self._next = time.monotonic() + self._interval
+            self._flush()
 
     def _flush(self) -> None:
         """Print the last progress of a stage if it was held back for coming too soon after the line before."""
+        self._timer.cancel()
         if self._held_back is not None:
             self._show(progress_text(self._held_back))
             self._held_back = None
