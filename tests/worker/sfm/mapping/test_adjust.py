@@ -13,6 +13,7 @@ import pytest
 
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.errors import Cancelled
+from splatmill_worker.images.lens import PANORAMA
 from splatmill_worker.sfm.mapping import adjust
 from splatmill_worker.sfm.mapping.adjust import adjust_with_lenses
 from tests.support.scenes.motions import FOCAL, Motion, ball, circle, grid, line, model_of
@@ -156,3 +157,51 @@ def test_the_trust_region_goes_on_where_an_earlier_call_has_left_it() -> None:
     assert adjust.radius_after(9 * first, 2, 3) == 81 / 8 * first
     assert adjust.radius_after(first, 8, 40) == first
     assert adjust.radius_after(first, 50, 0) == adjust.LARGEST_RADIUS
+
+
+def test_points_behind_their_cameras_are_left_out_of_the_errors() -> None:
+    model = model_of(ball, FOCAL)
+    lost, partly = list(model.points3D)[:2]
+    photos = {element.image_id for element in model.points3D[partly].track.elements}
+    places = {photo: model.images[photo].projection_center() for photo in photos}
+    # The cameras look at the origin from a distance of 4: the first point is behind all of them, the second behind one.
+    model.points3D[lost].xyz = [0.0, 0.0, 1000.0]
+    nearest = min(photos)
+    model.points3D[partly].xyz = 1.01 * places[nearest]
+    behind = {photo for photo in photos if _depth(model, photo, partly) <= 0}
+    assert nearest in behind
+    model.update_point_3d_errors()
+    assert model.compute_mean_reprojection_error() > 1e100
+    before = model.compute_num_observations()
+    removed = model.points3D[lost].track.length() + len(behind)
+    adjust.update_errors(model)
+    assert lost not in model.points3D
+    assert model.compute_num_observations() == before - removed
+    assert {each.image_id for each in model.points3D[partly].track.elements} == photos - behind
+    assert np.isfinite(model.compute_mean_reprojection_error())
+    assert model.compute_mean_reprojection_error() < 1e6
+
+
+def test_a_panorama_keeps_what_is_behind_it() -> None:
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(model=PANORAMA, width=800, height=400, params=[800.0, 400.0], camera_id=1)
+    )
+    points = np.random.default_rng(0).normal(0, 4, (50, 3))
+    for number in range(3):
+        pose = np.concatenate([np.eye(3), [[-0.5 * number], [0.0], [0.0]]], axis=1)
+        local = points @ pose[:, :3].T + pose[:, 3]
+        keypoints = [model.cameras[1].img_from_cam(each) for each in local]
+        image = pycolmap.Image(name=f"{number}.png", keypoints=keypoints, camera_id=1, image_id=number + 1)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
+    for number, point in enumerate(points):
+        track = pycolmap.Track([pycolmap.TrackElement(image, number) for image in (1, 2, 3)])
+        model.add_point3D(point, track, np.zeros(3, np.uint8))
+    assert (points[:, 2] < 0).any()
+    adjust.update_errors(model)
+    assert model.compute_num_observations() == 150
+    assert model.compute_mean_reprojection_error() < 1e-4
+
+
+def _depth(model: pycolmap.Reconstruction, photo: int, point: int) -> float:
+    return float((model.images[photo].cam_from_world() * model.points3D[point].xyz)[2])

@@ -137,6 +137,15 @@ def radius_after(radius: float, good: int, bad: int) -> float:
     return float(np.clip(radius * 3.0**good / 2.0**bad, FIRST_RADIUS, LARGEST_RADIUS))
 
 
+def update_errors(model: pycolmap.Reconstruction) -> None:
+    """Update the reprojection errors of the points, in place, without observations of points behind the camera.
+
+    The solver counts nothing for those, and so may move a point there; COLMAP's error of one is 1e154 pixels.
+    """
+    pycolmap.ObservationManager(model).filter_observations_with_negative_depth()
+    model.update_point_3d_errors()
+
+
 def median_error(model: pycolmap.Reconstruction) -> float:
     """Median over the points of the mean reprojection error that they hold, in pixels; infinite without points."""
     return float(np.median([point.error for point in model.points3D.values()] or [math.inf]))
@@ -314,7 +323,7 @@ def bundle_adjust(
         if good and steps.initial_cost - steps.final_cost <= FUNCTION_TOLERANCE * steps.initial_cost:
             break
         radius = radius_after(radius, good, steps.num_unsuccessful_steps)
-    model.update_point_3d_errors()
+    update_errors(model)
     stop_if(cancelled)
 
 

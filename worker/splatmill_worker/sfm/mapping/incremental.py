@@ -179,7 +179,8 @@ class IncrementalMapping:
             self._step(model, words if done == 0 else f"{words}, iteration {done + 1}")
             self._mapper.adjust_global_bundle(options, adjustment)
             if at_once < most:
-                # COLMAP does not return whether it has converged.
+                # COLMAP does not return whether it has converged. A point behind a camera has an error of 1e154 pixels.
+                self._mapper.observation_manager.filter_observations_with_negative_depth()
                 model.update_point_3d_errors()
                 last, error = error, model.compute_mean_reprojection_error()
                 if error >= (1.0 - self._options.ba_global_function_tolerance) * last:
