@@ -21,6 +21,7 @@ from splatmill_worker.scene import Camera, Float, Lens, Scene, Source, View, vie
 from splatmill_worker.sfm import posed, stereo
 from splatmill_worker.sfm.matching.overlap import by_overlap
 from splatmill_worker.sfm.options import LEAN
+from splatmill_worker.sfm.posed.judged import points
 from splatmill_worker.sfm.posed.judged.triangulation import Triangulated, triangulate
 from splatmill_worker.splat.plan.decide import decide
 from tests.support.plans.facts import FACTS
@@ -267,15 +268,18 @@ def test_wrong_cameras_are_named_and_the_random_start_says_why(bare: Scene, tmp_
         assert plan.reasons["initial"].startswith("The given cameras explain only")
 
 
+@pytest.mark.parametrize(("enough", "shift"), [(False, 5), (True, 5), (True, 2)])
 def test_points_with_tracks_are_checked_in_the_photos_that_the_tracks_name(
-    bare: Scene, tmp_path: Path
+    enough: bool, shift: int, bare: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Few points bring a search for more, which shows it as well."""
     given = posed.with_points(replace(bare, views=bare.views[:10]), tmp_path)
     assert given.point_views is not None
+    monkeypatch.setattr(points, "_lacks_points", lambda _: not enough)
     assert posed.with_points(given, tmp_path / "right").warnings == ()
     files = [view.image for view in given.views]
     exchanged = tuple(
-        replace(view, image=files[(index + 5) % len(files)]) for index, view in enumerate(given.views)
+        replace(view, image=files[(index + shift) % len(files)]) for index, view in enumerate(given.views)
     )
     wrong = posed.with_points(replace(given, views=exchanged), tmp_path / "wrong")
     [warning] = wrong.warnings

@@ -48,7 +48,8 @@ ABOVE_CHANCE = 1.25
 
 PLAIN = 0.5
 """Share of the photos that show a point's colour from which it does not matter that others would agree as well: in a
-scene of one colour, all do."""
+scene of one colour, all do. Below it, the photos that tracks name may be exchanged ones: of photos of one place, a
+third agrees."""
 
 CHECKED = 24
 """Photos in which the colours of points with tracks are compared, at most."""
@@ -150,20 +151,19 @@ def by_chance(agreement: float, chance: float) -> bool:
 
 
 def _shows_others(scene: Scene, cancelled: Callable[[], bool]) -> bool:
-    """Whether the photos do not show the colours of the points whose tracks name them, so that the cameras or the
-    points may be those of other photos. Some photos are compared, evenly chosen."""
+    """Whether the photos show the colours of fewer than PLAIN of the points whose tracks name them, so that the cameras
+    or the points may be those of other photos; also where they show none. Some photos are compared, evenly chosen."""
     if scene.point_views is None or (scene.colors == scene.colors[0]).all():
         return False
     owners = np.repeat(np.arange(len(scene.points)), np.diff(scene.point_views.offsets))
     used = [index for index, view in enumerate(scene.views) if view.split != "test"]
-    shown, agreeing, exchanged = 0, 0, 0
+    shown, agreeing = 0, 0
     for index in used[:: -(-len(used) // CHECKED)]:
         rows = owners[scene.point_views.views == index]
         evidence = evidence_of(scene.points[rows], scene.colors[rows], [scene.views[index]], cancelled)
         shown += int(evidence.shown.sum())
         agreeing += int(evidence.agreeing.sum())
-        exchanged += int(evidence.by_chance.sum())
-    return by_chance(agreeing / max(1, shown), exchanged / max(1, shown))
+    return agreeing < PLAIN * max(1, shown)
 
 
 def _loose_note(given: int, judged: int, kept: int, evidence: Evidence, plain: bool) -> str:
