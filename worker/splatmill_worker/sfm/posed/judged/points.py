@@ -48,8 +48,11 @@ ABOVE_CHANCE = 1.25
 
 PLAIN = 0.5
 """Share of the photos that show a point's colour from which it does not matter that others would agree as well: in a
-scene of one colour, all do. Below it, the photos that tracks name may be exchanged ones: of photos of one place, a
-third agrees."""
+scene of one colour, all do."""
+
+OWN_PHOTOS = 0.5
+"""Share of the photos named by tracks that show the colours of their points, below which they may be exchanged ones
+(decisions: OWN_PHOTOS)."""
 
 CHECKED = 24
 """Photos in which the colours of points with tracks are compared, at most."""
@@ -151,8 +154,8 @@ def by_chance(agreement: float, chance: float) -> bool:
 
 
 def _shows_others(scene: Scene, cancelled: Callable[[], bool]) -> bool:
-    """Whether the photos show the colours of fewer than PLAIN of the points whose tracks name them, so that the cameras
-    or the points may be those of other photos; also where they show none. Some photos are compared, evenly chosen."""
+    """Whether the photos show the colours of fewer than OWN_PHOTOS of the points whose tracks name them, so that the
+    cameras or the points may be those of other photos; also where they show none. Some photos are compared."""
     if scene.point_views is None or (scene.colors == scene.colors[0]).all():
         return False
     owners = np.repeat(np.arange(len(scene.points)), np.diff(scene.point_views.offsets))
@@ -163,7 +166,7 @@ def _shows_others(scene: Scene, cancelled: Callable[[], bool]) -> bool:
         evidence = evidence_of(scene.points[rows], scene.colors[rows], [scene.views[index]], cancelled)
         shown += int(evidence.shown.sum())
         agreeing += int(evidence.agreeing.sum())
-    return agreeing < PLAIN * max(1, shown)
+    return agreeing < OWN_PHOTOS * max(1, shown)
 
 
 def _loose_note(given: int, judged: int, kept: int, evidence: Evidence, plain: bool) -> str:
