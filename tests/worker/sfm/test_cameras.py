@@ -54,3 +54,19 @@ def test_fisheyes_have_cameras_of_their_own() -> None:
     ordinary = cameras.as_pinholes(groups)
     assert ordinary[0] is groups[0]
     assert {(group.focal, group.known, group.is_fisheye) for group in ordinary[1:]} == {(1.2, False, False)}
+
+
+def test_the_sensor_of_a_known_camera_gives_the_focal_length() -> None:
+    # Of COLMAP's table; the sensor is 36 mm wide. The photo itself, which is not there, is not opened.
+    tags = {"make": "Canon", "model": "Canon EOS 5D Mark II", "focal_length": 50.0}
+    (group,) = cameras.group([usable("1", **tags)])
+    assert group.known
+    assert group.focal == pytest.approx(50.0 / 36.0)
+    for wrong in (
+        {"model": "not in the table"},
+        {"make": None},
+        {"focal_length": 1e300},
+        {"focal_length": 1e-9},
+    ):
+        (unknown,) = cameras.group([usable("1", **tags | wrong)])
+        assert not unknown.known

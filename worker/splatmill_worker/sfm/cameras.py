@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import math
 import re
+import tempfile
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
 
+from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
+
 from splatmill.schema.quantities import counted
 from splatmill_worker.colmap import pycolmap
+from splatmill_worker.images.exif import EXIF_IFD, FOCAL_LENGTH, MAKE, MODEL
 from splatmill_worker.images.prepare import UsablePhoto
 
 DEFAULT_FOCAL = 1.2
@@ -30,6 +35,9 @@ _FISHEYE = re.compile("fish.?eye", re.IGNORECASE)
 
 FOCAL_BOUNDS = 0.2, 9.0
 """Focal lengths over the longest side that lenses have: from an 8 mm fisheye to 300 mm on full frame."""
+
+LENSES = 0.1, 10_000.0
+"""Focal lengths of lenses in millimetres; others in EXIF are mistakes."""
 
 
 @dataclass(frozen=True)
@@ -140,6 +148,19 @@ def _focal(photo: UsablePhoto) -> float | None:
         return photo.exif.focal_in_diagonals * math.hypot(photo.width, photo.height) / longest
     if photo.exif.focal_length is None or photo.exif.model is None:
         return None
-    bitmap = pycolmap.Bitmap.read(photo.path, as_rgb=False)
+    return _focal_by_sensor(photo.exif.make or "", photo.exif.model, photo.exif.focal_length)
+
+
+def _focal_by_sensor(make: str, model: str, millimetres: float) -> float | None:
+    """The focal length over the longest side, where COLMAP knows the sensor of the camera."""
+    if not LENSES[0] <= millimetres <= LENSES[1]:
+        return None
+    tags = Image.Exif()
+    tags[MAKE], tags[MODEL] = make, model
+    tags.get_ifd(EXIF_IFD)[FOCAL_LENGTH] = IFDRational(round(1000 * millimetres), 1000)
+    # COLMAP reads the tags of a picture alone, and gets one of the worker's own, not the photo of a stranger.
+    with tempfile.NamedTemporaryFile(suffix=".jpg") as file:
+        Image.new("L", (16, 16)).save(file.name, exif=tags)
+        bitmap = pycolmap.Bitmap.read(file.name, as_rgb=False)
     focal = bitmap.exif_focal_length() if bitmap is not None else None
     return None if bitmap is None or focal is None else float(focal) / max(bitmap.width, bitmap.height)
