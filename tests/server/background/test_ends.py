@@ -85,7 +85,8 @@ def test_a_failed_attempt_is_repeated_when_it_is_due(
     # And one that is asked for by hand does not wait for the next look.
     answer = app.http.post(f"/v1/webhooks/{made['id']}/deliveries/{delivery['id']}/repeat")
     assert answer.status_code == 202
-    wait_for(lambda: len(peer.seen) == 3)
+    wait_for(lambda: [d for d in log_of(app, made) if len(d["attempts"]) > 2 and d["state"] == "delivered"])
+    assert [request.path for request in peer.seen] == 3 * ["/hook"], log_of(app, made)
 
 
 def test_one_of_several_processes_announces_an_end(
