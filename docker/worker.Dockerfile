@@ -12,7 +12,7 @@ ENV PATH=/opt/splatmill/bin:$PATH PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHE
 WORKDIR /src
 COPY constraints.txt ./
 # The large wheels first: they change rarely, so that a change of the code leaves this layer as it is.
-RUN pip install -q -c constraints.txt -U pip && pip install -q $PIP_ARGS -c constraints.txt torch pycolmap matplotlib av
+RUN pip install -q -c constraints.txt -U pip && pip install -q $PIP_ARGS -c constraints.txt torch pycolmap opencv-python-headless matplotlib av
 COPY client client
 COPY worker worker
 RUN pip install -q $PIP_ARGS -c constraints.txt ./client ./worker

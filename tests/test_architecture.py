@@ -90,17 +90,17 @@ def test_every_backend_has_the_same_stems(backend: str):
     [
         ("splatmill", {"torch", "numpy", "redis", "rq", "obstore", "fastapi"}),
         ("splatmill.schema", {"torch", "numpy", "redis", "rq", "obstore", "fastapi"}),
-        ("splatmill_server.app", {"torch", "numpy", "pycolmap", "splatmill_worker"}),
+        ("splatmill_server.app", {"torch", "numpy", "pycolmap", "cv2", "splatmill_worker"}),
         # The queue worker forks an attempt; torch's and COLMAP's threads do not survive a fork.
-        ("splatmill_worker.service.rq_worker", {"torch", "pycolmap", "splatmill_server"}),
+        ("splatmill_worker.service.rq_worker", {"torch", "pycolmap", "cv2", "splatmill_server"}),
         # An attempt imports this before its first word; matplotlib would take a fifth of that time.
         ("splatmill_worker.pipeline", {"matplotlib", "triton"}),
-        ("splatmill_worker", {"torch", "numpy", "pycolmap", "redis", "pydantic"}),
-        ("splatmill_worker.kernels", {"triton", "pycolmap", "redis", "splatmill"}),
+        ("splatmill_worker", {"torch", "numpy", "pycolmap", "cv2", "redis", "pydantic"}),
+        ("splatmill_worker.kernels", {"triton", "pycolmap", "cv2", "redis", "splatmill"}),
         # The processes that decode photos import this: each attempt starts some, which know neither Redis nor messages.
         (
             "splatmill_worker.images.video.video",
-            {"torch", "pycolmap", "redis", "rq", "obstore", "httpx", "pydantic"},
+            {"torch", "pycolmap", "cv2", "redis", "rq", "obstore", "httpx", "pydantic"},
         ),
     ],
 )
@@ -125,8 +125,12 @@ def test_a_name_of_the_schema_is_one_thing_in_all_its_modules():
 
 
 def test_untrusted_files_are_opened_in_one_place():
-    """`Image.open` and `av.open` for reading, and other decoders: pictures and videos come from strangers."""
+    """`Image.open` and `av.open` for reading, and other decoders: pictures and videos come from strangers.
+
+    Of OpenCV, one module offers what finds features.
+    """
     guarded = PARTS["splatmill_worker"] / "images" / "guarded.py"
+    opencv = PARTS["splatmill_worker"] / "opencv.py"
     decoders = {"cv2", "imageio", "skimage", "tifffile", "rawpy", "torchvision", "decord", "moviepy", "wand"}
     found = []
     for path in [
@@ -144,9 +148,10 @@ def test_untrusted_files_are_opened_in_one_place():
                     found.append(f"{path}:{node.lineno}")
                 case ast.Import() | ast.ImportFrom():
                     names = [getattr(node, "module", None) or "", *(alias.name for alias in node.names)]
-                    if decoders & {name.partition(".")[0] for name in names}:
+                    if decoders & {name.partition(".")[0] for name in names} and path != opencv:
                         found.append(f"{path}:{node.lineno}")
     assert not found
+    assert set(re.findall(r"cv2\.(\w+)", opencv.read_text())) == {"setNumThreads", "SIFT", "__version__"}
 
 
 def test_the_server_and_the_client_open_no_pictures():

@@ -136,11 +136,10 @@ def colmap_model(cameras: dict[str, Camera]) -> dict[str, bytes]:
     }
 
 
-def test_cancel_during_reconstruction_takes_under_two_seconds(
-    true_service: Up, photos: tuple[Path, dict[str, Camera]]
-) -> None:
+def test_cancel_during_reconstruction_takes_under_two_seconds(true_service: Up, tmp_path: Path) -> None:
     up = true_service
-    capture = upload(up, photos[0])
+    synthetic.capture(tmp_path, 20, 320, 240, samples=1)  # seconds of work
+    capture = upload(up, tmp_path)
     job_id = up.http.post("/v1/jobs", json={"capture": capture}).json()["id"]
 
     def inside() -> list[int]:

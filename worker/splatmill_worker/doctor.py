@@ -88,6 +88,7 @@ def _parts() -> Iterator[Finding]:
         "splatmill-worker",
         "torch",
         "pycolmap",
+        "opencv-python-headless",
         "av",
         "pillow-heif",
     ):

@@ -314,8 +314,8 @@ class TrainOptions(Request):
         default=Effort.auto,
         description=(
             "Number and resolution of the features from which the cameras are recovered. With auto, lean is "
-            "tried first, and more effort is spent only if too few photos can be placed. Choose high for "
-            "photos with little texture."
+            "tried first, or standard if there are few photos, and more effort is spent only if too few "
+            "can be placed. Choose high for photos with little texture."
         ),
         json_schema_extra=_CAMERAS,
     )

@@ -56,7 +56,7 @@ ONCE = (
     "splatmill train photos -o splat --time-budget 30s --novel-view\n",
 )
 """Commands of the first page that run once for all pages: the others begin with the `photos` and `splat` they left."""
-ONCE_SMALLER = (" --count 24 --width 192 --height 144 --samples 1", " --image-size 120")
+ONCE_SMALLER = (" --count 24 --width 208 --height 156 --samples 1", " --image-size 120")
 
 
 def smaller(text: str) -> str:

@@ -17,7 +17,6 @@ from splatmill_worker.images.load import load_view
 from splatmill_worker.images.overlays import overlays
 from splatmill_worker.images.prepare import Prepared, prepare
 from splatmill_worker.sfm import features, posed
-from splatmill_worker.sfm.features import FeatureStore
 from tests.support.posed_sets import frames, transforms
 
 SIZE = (64, 48)
@@ -159,9 +158,8 @@ def test_masks_of_two_labels_show_the_higher_one(
         hidden = 64 if len(named) == 2 and view.name == "0.jpg" else 16
         assert not loaded[:, :hidden].any()
         assert loaded[:, hidden:].all()
-        store = FeatureStore(tmp_path / "store")
-        features._reduce(one, 64, store, one.name)
-        reduced = np.asarray(Image.open(store.masks / f"{one.name}.png"))
+        _, reduced = features._reduced(one, 64)
+        assert reduced is not None
         assert np.array_equal(reduced, np.where(loaded, 255, 0))
         region = np.zeros((6, 8), bool)
         region[:, -1] = True

@@ -1,4 +1,4 @@
-"""Proves that a higher effort keeps the features and pairs of photos that are not extracted anew, the cache's keys, and
+"""Proves that a higher effort keeps the features and pairs of photos that are not searched anew, the cache's keys, and
 which mappers are tried.
 
 Proven on the database of generated photos. Does not prove that a higher effort registers more photos.
@@ -16,7 +16,6 @@ import pytest
 from splatmill_worker import sfm, synthetic
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.sfm import effort, features, options, solve, trials
-from splatmill_worker.sfm.features import FeatureStore
 from splatmill_worker.sfm.mapping import mapper
 from splatmill_worker.sfm.matching import pairs
 from splatmill_worker.sfm.run import SfmRun
@@ -26,21 +25,19 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> FeatureStore:
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("effort")
     synthetic.capture(folder / "images", 8, 240, 180, samples=1)
     options = sfm.SfmOptions(effort="lean", stereo=False)
     with suppress(sfm.SfmFailed):  # few may be registered; features and pairs are stored
         sfm.reconstruct(folder / "images", None, folder / "work", options, lambda *_: None, lambda: False)
-    return FeatureStore(next((folder / "work").rglob("database.db")).parent)
+    return next((folder / "work").rglob("database.db"))
 
 
-def test_only_photos_extracted_anew_lose_their_features_and_pairs(
-    store: FeatureStore, tmp_path: Path
-) -> None:
-    target = FeatureStore(tmp_path / "next")
-    features.carry_over(store, target, {2, 5})
-    old, new = pycolmap.Database.open(store.database), pycolmap.Database.open(target.database)
+def test_only_photos_searched_anew_lose_their_features_and_pairs(source: Path, tmp_path: Path) -> None:
+    target = tmp_path / "next.db"
+    features.carry_over(source, target, {2, 5})
+    old, new = pycolmap.Database.open(source), pycolmap.Database.open(target)
     try:
         ids = {features.photo_index(image.name): image.image_id for image in new.read_all_images()}
         assert ids == {features.photo_index(image.name): image.image_id for image in old.read_all_images()}
@@ -62,12 +59,12 @@ def test_only_photos_extracted_anew_lose_their_features_and_pairs(
         new.close()
 
 
-def test_a_database_that_exists_is_left_as_it_is(store: FeatureStore, tmp_path: Path) -> None:
-    target = FeatureStore(tmp_path / "next")
-    features.carry_over(store, target, {0})
-    stamp = target.database.stat().st_mtime_ns
-    features.carry_over(store, target, {1, 2, 3})
-    assert target.database.stat().st_mtime_ns == stamp
+def test_a_database_that_exists_is_left_as_it_is(source: Path, tmp_path: Path) -> None:
+    target = tmp_path / "next.db"
+    features.carry_over(source, target, {0})
+    stamp = target.stat().st_mtime_ns
+    features.carry_over(source, target, {1, 2, 3})
+    assert target.stat().st_mtime_ns == stamp
 
 
 def test_another_seed_or_matcher_has_a_database_of_its_own(tmp_path: Path) -> None:
@@ -119,7 +116,7 @@ def test_more_pairs_add_photos_to_a_model_that_has_half_of_them(
     monkeypatch.setattr(effort, "best_mapping", answer("anew"))
     monkeypatch.setattr(effort, "registered_counts", lambda mapped: (mapped.registered, mapped.registered))
     run: Any = SimpleNamespace(count=10)
-    result: Any = SimpleNamespace(store=SimpleNamespace(database=None), verified=[])
+    result: Any = SimpleNamespace(database=None, verified=[])
     mapped: Any = SimpleNamespace(registered=registered)
     assert effort._mapped_with_more(run, result, mapped).registered == kept
     assert calls == [called]
@@ -150,27 +147,42 @@ def _tried(
 
 
 @pytest.mark.parametrize(
-    ("registered", "spent", "tried"),
+    ("count", "registered", "spent", "tried"),
     [
-        (6, 9.0, ["lean", "standard", "high"]),
-        (6, 11.0, ["lean"]),
-        (4, 11.0, ["lean", "standard", "high"]),  # a model of less than half of the photos is no result yet
-        (10, 11.0, ["lean"]),
+        (50, 30, 9.0, ["lean", "standard", "high"]),
+        (50, 30, 11.0, ["lean"]),
+        (
+            50,
+            20,
+            11.0,
+            ["lean", "standard", "high"],
+        ),  # a model of less than half of the photos is no result yet
+        (50, 50, 11.0, ["lean"]),
+        (solve.FEW_PHOTOS, 20, 9.0, ["standard", "high"]),
+        (solve.FEW_PHOTOS, 20, 11.0, ["standard"]),
     ],
 )
 def test_no_higher_effort_is_tried_where_there_is_no_time_for_it(
-    registered: int, spent: float, tried: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    count: int,
+    registered: int,
+    spent: float,
+    tried: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     calls: list[str] = []
+    full = [SimpleNamespace(scales=np.ones(options.HIGH.features))]
 
     def solve_at(_run: object, tried_effort: options.Effort, _best: object) -> Any:
         calls.append(tried_effort.name)
-        return SimpleNamespace(mapped=None, effort=tried_effort, verified=[(0, 1)])
+        return SimpleNamespace(mapped=None, effort=tried_effort, verified=[(0, 1)], features=full)
 
     monkeypatch.setattr(solve, "solve_at", solve_at)
     monkeypatch.setattr(solve, "registered_counts", lambda _: (registered, registered))
     monkeypatch.setattr(solve, "unfold", lambda *_: None)
-    prepared: Any = SimpleNamespace(photos=[SimpleNamespace(width=640, height=480, is_panorama=False)] * 10)
+    prepared: Any = SimpleNamespace(
+        photos=[SimpleNamespace(width=640, height=480, is_panorama=False)] * count
+    )
     asked = sfm.SfmOptions(seconds=40.0)
     with ThreadPoolExecutor(1) as pool:
         run = SfmRun(prepared, [], "SIMPLE_RADIAL", asked, tmp_path, 1, pool, lambda *_: None, lambda: False)
@@ -179,9 +191,59 @@ def test_no_higher_effort_is_tried_where_there_is_no_time_for_it(
     assert calls == tried
     assert (
         run.hurried
-        == any("no time to try standard" in note for note in run.notes)
-        == (spent > 10 and registered == 6)
+        == any("There was no time to try" in note for note in run.notes)
+        == (len(tried) == 1 and registered < count)
     )
+
+
+@pytest.mark.parametrize(("found", "tried"), [(31, ["lean", "high"]), (29, ["lean"])])
+def test_the_next_effort_but_one_is_tried_where_the_next_would_find_the_same(
+    found: int, tried: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[str] = []
+
+    def solve_at(_run: object, tried_effort: options.Effort, _best: object) -> Any:
+        calls.append(tried_effort.name)
+        few = [SimpleNamespace(scales=np.ones(found))] * 50
+        return SimpleNamespace(mapped=None, effort=tried_effort, verified=[(0, 1)], features=few)
+
+    monkeypatch.setattr(solve, "solve_at", solve_at)
+    monkeypatch.setattr(solve, "registered_counts", lambda _: (3, 3))
+    monkeypatch.setattr(solve, "unfold", lambda *_: None)
+    prepared: Any = SimpleNamespace(photos=[SimpleNamespace(width=640, height=480, is_panorama=False)] * 50)
+    with ThreadPoolExecutor(1) as pool:
+        run = SfmRun(
+            prepared, [], "SIMPLE_RADIAL", sfm.SfmOptions(), tmp_path, 1, pool, lambda *_: None, lambda: False
+        )
+        with nullcontext() if len(tried) > 1 else pytest.raises(sfm.SfmFailed, match="at most 29 features"):
+            solve._solve(run)
+    assert calls == tried
+
+
+@pytest.mark.parametrize(
+    ("found", "count", "side", "matcher", "skipped"),
+    [
+        (options.LEAN.features - 1, 10, 640, "auto", {"standard", "high"}),
+        (options.LEAN.features - 1, pairs.EXHAUSTIVE_UP_TO + 1, 640, "auto", {"standard"}),  # more pairs
+        (options.LEAN.features - 1, pairs.EXHAUSTIVE_UP_TO + 1, 640, "exhaustive", {"standard", "high"}),
+        (options.LEAN.features - 1, 10, 640, "sequential", {"standard"}),
+        (options.LEAN.features - 1, 10, 641, "auto", set()),
+        (options.LEAN.features, 10, 640, "auto", set()),
+    ],
+)
+def test_an_effort_that_would_find_the_same_is_left_out(
+    found: int, count: int, side: int, matcher: Any, skipped: set[str]
+) -> None:
+    run: Any = SimpleNamespace(
+        count=count,
+        reduced_side=lambda effort: min(effort.side, side),
+        options=sfm.SfmOptions(matcher=matcher),
+    )
+    best: Any = SimpleNamespace(
+        effort=options.LEAN, features=[SimpleNamespace(scales=np.ones(each)) for each in (3, found)]
+    )
+    higher = options.STANDARD, options.HIGH
+    assert {each.name for each in higher if solve._finds_the_same(run, best, each)} == skipped
 
 
 def test_a_higher_effort_begins_with_the_model_of_the_photos_that_it_does_not_retry() -> None:
@@ -205,7 +267,7 @@ def test_a_higher_effort_begins_with_the_model_of_the_photos_that_it_does_not_re
 
 @pytest.mark.parametrize(
     ("largest", "sides"),
-    [(640, {640}), (1000, {800, 1000}), (4000, {800, 1400})],
+    [(640, {640}), (1000, {640, 800, 1000}), (4000, {640, 800, 1400})],
     ids=["small", "middle", "large"],
 )
 def test_photos_that_no_effort_reduces_are_of_one_size_for_all(

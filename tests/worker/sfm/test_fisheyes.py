@@ -111,8 +111,8 @@ def test_round_pictures_of_an_ordinary_lens_have_its_angle(tmp_path: Path) -> No
 
 
 def test_where_more_are_placed_as_photos_of_an_ordinary_lens_they_are_taken_for_those(tmp_path: Path) -> None:
-    """A tenth of the angle of a fisheye, as of a microscope. Does not prove that such photos are placed well."""
-    round_pictures(tmp_path / "images", 1400.0, 8, 0.12, samples=2)
+    """An eighth of the angle of a fisheye, as of a microscope. Does not prove that such photos are placed well."""
+    round_pictures(tmp_path / "images", 1000.0, 8, 0.2, samples=2)
     scene = recovered(tmp_path / "images", tmp_path / "work")
     assert any(said.startswith("As photos of a fisheye lens, 0 of 8 were placed") for said in scene.notes)
     assert not any("taken for those of a fisheye lens, by" in said for said in scene.notes)

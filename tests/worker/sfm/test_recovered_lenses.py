@@ -30,8 +30,8 @@ def photograph(path: Path, angle: float, pitch: float, focal: float) -> None:
 
 
 def reconstruct(folder: Path) -> Scene:
-    # The first effort places all photos; what the others add is in test_effort.
-    options = sfm.SfmOptions(effort="lean", stereo=False)
+    # One effort places all photos; what others add is in test_effort.
+    options = sfm.SfmOptions(effort="standard", stereo=False)
     return sfm.reconstruct(folder / "images", None, folder / "work", options, lambda *_: None, lambda: False)
 
 

@@ -30,7 +30,7 @@ COUNT = 30
 
 
 def reconstruct(images: Path, workdir: Path) -> Scene:
-    options = sfm.SfmOptions(effort="lean", stereo=False)
+    options = sfm.SfmOptions(effort="standard", stereo=False)
     return sfm.reconstruct(images, None, workdir, options, lambda *_: None, lambda: False)
 
 
@@ -119,11 +119,11 @@ def test_where_too_few_photos_would_be_left_the_model_is_kept_and_doubted(
     assert "gave no better cameras" in note
     assert scene.facts["pairs_alike"] == 0
     (result,) = kept
-    assert result.view_graph == result.store.database
+    assert result.view_graph == result.database
     assert result.mapped is not None
     assert result.mapped.largest is not None
     poses = Poses(result.mapped.largest)
-    database = pycolmap.Database.open(result.store.database)
+    database = pycolmap.Database.open(result.database)
     try:
         shares = {pair: agreement(poses, result, database, pair) for pair in result.verified}
     finally:

@@ -9,8 +9,8 @@ import numpy as np
 
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.errors import SfmFailed
+from splatmill_worker.opencv import VERSION as OPENCV_VERSION
 from splatmill_worker.sfm import features
-from splatmill_worker.sfm.features import FeatureStore
 from splatmill_worker.sfm.mapping import mapper
 from splatmill_worker.sfm.mapping.registered import registered
 from splatmill_worker.sfm.matching import pairs, two_view
@@ -22,10 +22,10 @@ CONNECTING_ROUNDS = 2
 """Largest number of times that more pairs are matched to connect the components of the view graph."""
 
 RETRY_PARTNERS = 4
-"""Likely partners of each photo without a reliable pose whose features are extracted anew, together with its own."""
+"""Likely partners of each photo without a reliable pose whose features are found anew, together with its own."""
 
 RETRY_ALL = 0.8
-"""Share of the photos: where more would be extracted anew, all of them are."""
+"""Share of the photos: where the features of more would be found anew, those of all of them are."""
 
 
 def solve_at(run: SfmRun, effort: Effort, earlier: EffortResult | None) -> EffortResult:
@@ -33,13 +33,14 @@ def solve_at(run: SfmRun, effort: Effort, earlier: EffortResult | None) -> Effor
 
     What `earlier` found of photos that it registered reliably is kept when both efforts use photos of the same size:
     features and pairs, and their poses and points where these photos are half of all. Raises SfmFailed when the
-    photos have too few features, OSError when COLMAP cannot read the reduced photos, and Cancelled.
+    photos have too few features, and Cancelled.
     """
     retried = None
     if earlier is not None and run.reduced_side(earlier.effort) == run.reduced_side(effort):
         retried = _retried(run, earlier)
     key = digest(
         VERSION,
+        OPENCV_VERSION,
         effort,
         run.options.matcher,
         run.options.seed,
@@ -47,39 +48,35 @@ def solve_at(run: SfmRun, effort: Effort, earlier: EffortResult | None) -> Effor
         [(group.photos, group.focal, group.center, group.is_fisheye) for group in run.groups],
         sorted(retried or ()),
     )
-    result = EffortResult(effort, FeatureStore(run.folder / f"{effort.name}-{key}"))
+    result = EffortResult(effort, run.folder / f"{effort.name}-{key}" / "database.db")
     with run.clock("features"):
         if earlier is not None and retried is not None:
-            features.carry_over(earlier.store, result.store, retried)
+            features.carry_over(earlier.database, result.database, retried)
         features.extract(
             run.prepared.photos,
             run.groups,
             effort,
             run.camera_model,
-            result.store,
-            run.threads,
+            result.database,
+            run.pool,
             run.on_progress,
             run.cancelled,
         )
-    database = pycolmap.Database.open(result.store.database)
+    database = pycolmap.Database.open(result.database)
     try:
         with run.clock("features"):
             result.ids, result.features = features.load(database)
-        if len(result.ids) < run.count:
-            raise OSError(
-                f"COLMAP could read only {len(result.ids)} of the {run.count} reduced photos in "
-                f"{result.store.images}. Check whether the disk is full."
-            )
-        _require_features(run, result)
+        if effort.name != LEAN.name:  # a higher effort may find more
+            require_features(run, result)
         _match(run, result, _select_pairs(run, result), database)
         _connect(run, result, database)
         if not result.verified:
             return result
         kept = None if earlier is None or retried is None else _without(earlier.mapped, retried)
         if kept is not None and 2 * kept.registered >= run.count:
-            result.mapped = extended_mapping(run, result.store.database, kept)
+            result.mapped = extended_mapping(run, result.database, kept)
         else:
-            result.mapped = best_mapping(run, result.store.database, result.verified)
+            result.mapped = best_mapping(run, result.database, result.verified)
         left = _unregistered(run, result)
         if left and _match_unregistered(run, result, left, database):
             result.mapped = _mapped_with_more(run, result, result.mapped)
@@ -105,9 +102,9 @@ def _mapped_with_more(run: SfmRun, result: EffortResult, mapped: mapper.Mapped) 
     They are mapped anew only where the model has less than half of the photos, and so may be of the wrong part.
     """
     if 2 * mapped.registered >= run.count:
-        again = extended_mapping(run, result.store.database, mapped)
+        again = extended_mapping(run, result.database, mapped)
     else:
-        again = best_mapping(run, result.store.database, result.verified)
+        again = best_mapping(run, result.database, result.verified)
     return again if registered_counts(again) > registered_counts(mapped) else mapped
 
 
@@ -117,7 +114,7 @@ def registered_photos(model: pycolmap.Reconstruction) -> set[int]:
 
 
 def _retried(run: SfmRun, result: EffortResult) -> set[int] | None:
-    """Photos whose features the next effort extracts anew: those without a reliable pose, and their likely partners.
+    """Photos whose features the next effort finds anew: those without a reliable pose, and their likely partners.
 
     None, for all photos, when these are more than RETRY_ALL of them or when no pairs have been scored.
     """
@@ -135,14 +132,11 @@ def _retried(run: SfmRun, result: EffortResult) -> set[int] | None:
     return None if len(retried) > RETRY_ALL * run.count else retried
 
 
-def _require_features(run: SfmRun, result: EffortResult) -> None:
-    """Raise SfmFailed when half of the photos have too few features.
-
-    At the lean effort nothing is raised: a higher effort, which finds more features, may follow.
-    """
+def require_features(run: SfmRun, result: EffortResult) -> None:
+    """Raise SfmFailed when half of the photos have too few features."""
     median = float(np.median([len(found.scales) for found in result.features]))
     least = 2 * two_view.MIN_INLIERS
-    if result.effort.name != LEAN.name and median < least:
+    if median < least:
         raise SfmFailed(
             "sfm_no_features",
             f"Half of the {run.count} photos have at most {int(median)} features; at least {least} are needed.",
@@ -202,7 +196,6 @@ def _match(run: SfmRun, result: EffortResult, chosen: set[pairs.Pair], database:
             result.features,
             result.ids,
             database,
-            result.effort.features,
             run.options.seed,
             run.pool,
             lambda done, _: run.on_progress("matching", before + done, total, "pairs matched"),

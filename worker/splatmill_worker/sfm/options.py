@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Literal
 
 
@@ -10,7 +10,8 @@ from typing import Literal
 class SfmOptions:
     """Options of structure from motion; `auto` is decided from the photos and their matches.
 
-    effort: how thoroughly features are searched for and matched; `auto` starts lean and raises it where needed.
+    effort: how thoroughly features are searched for and matched; `auto` starts lean, or with
+        the standard effort where photos are few, and raises it where needed.
     matcher: how pairs of photos are chosen.
     mapper: which of COLMAP's mappers estimates the poses.
     side: longest side of the photos that features are found on, in pixels; None: by the effort.
@@ -44,27 +45,24 @@ class Effort:
     name: stable name.
     side: longest side of the photos that features are found on, in pixels.
     features: features per photo, at most.
-    first_octave: of SIFT's scale space. -1 doubles the photo's size first, which gives three times the features in
-        four times the time.
-    orientations: orientations per feature, at most.
     partners: number of other photos that each photo is matched with.
     """
 
     name: str
     side: int
     features: int
-    first_octave: int
-    orientations: int
     partners: int
 
 
-LEAN = Effort("lean", side=800, features=1500, first_octave=0, orientations=1, partners=10)
-STANDARD = Effort("standard", side=800, features=2500, first_octave=-1, orientations=1, partners=10)
-HIGH = Effort("high", side=1400, features=6000, first_octave=-1, orientations=2, partners=16)
+# Larger photos and more features, step by step (decisions: sift).
+LEAN = Effort("lean", side=640, features=1000, partners=10)
+STANDARD = Effort("standard", side=800, features=2500, partners=10)
+HIGH = Effort("high", side=1400, features=6000, partners=16)
+
 EFFORTS = {effort.name: effort for effort in (LEAN, STANDARD, HIGH)}
 
 NEXT_EFFORT = 3.0
-"""Time of an effort over that of all before it: STANDARD's features take four times those of LEAN, and mapping less."""
+"""Time of an effort over that of all before it, nearly at most (decisions: FEW_PHOTOS)."""
 
 FISHEYE = "SIMPLE_RADIAL_FISHEYE"
 """COLMAP's camera model by which photos of a fisheye lens are mapped."""
@@ -75,13 +73,3 @@ those of a photo that shows 120 degrees across."""
 
 PANORAMA_FEATURES = 4
 """Features of a panorama, over those of other photos: it shows as much as several of them."""
-
-SMALL_SIDE = 700
-"""Longest side, in pixels, up to which SIFT doubles the size of photos at any effort: small photos have few features,
-and doubling them takes little time."""
-
-
-def fitted(effort: Effort, longest_side: int) -> Effort:
-    """The effort adapted to photos whose longest side has `longest_side` pixels."""
-    small = effort.first_octave == 0 and min(effort.side, longest_side) <= SMALL_SIDE
-    return replace(effort, first_octave=-1) if small else effort

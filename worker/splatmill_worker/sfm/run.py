@@ -16,14 +16,14 @@ from splatmill_worker.colmap import pycolmap
 from splatmill_worker.images.prepare import Prepared
 from splatmill_worker.sfm.callbacks import OnProgress
 from splatmill_worker.sfm.cameras import CameraGroup
-from splatmill_worker.sfm.features import Features, FeatureStore
 from splatmill_worker.sfm.mapping import mapper
 from splatmill_worker.sfm.matching.pairs import Pair
 from splatmill_worker.sfm.matching.two_view import MIN_INLIERS, TwoView
 from splatmill_worker.sfm.options import Effort, SfmOptions
 from splatmill_worker.sfm.placed import PlacingObserver, placed
+from splatmill_worker.sfm.sift import Features
 
-VERSION = 8
+VERSION = 9
 """Version of everything that is cached; a cache with another version is not read."""
 
 UNFOLDED = "unfolded.db"
@@ -35,7 +35,7 @@ class EffortResult:
     """What one effort has found so far.
 
     effort: which effort.
-    store: where its features and matches lie.
+    database: COLMAP's, with cameras, images, features, matches and two-view geometries.
     ids: COLMAP's image id of each photo.
     features: of each photo.
     matched: outcome of each pair that was matched.
@@ -44,7 +44,7 @@ class EffortResult:
     """
 
     effort: Effort
-    store: FeatureStore
+    database: Path
     ids: dict[int, int] = field(default_factory=dict)
     features: list[Features] = field(default_factory=list)
     matched: dict[Pair, TwoView] = field(default_factory=dict)
@@ -59,7 +59,7 @@ class EffortResult:
     @property
     def view_graph(self) -> Path:
         """COLMAP's database that `mapped` was made from: without the pairs `left_out`."""
-        return self.store.folder / UNFOLDED if self.left_out else self.store.database
+        return self.database.with_name(UNFOLDED) if self.left_out else self.database
 
 
 @dataclass

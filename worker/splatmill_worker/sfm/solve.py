@@ -1,4 +1,4 @@
-"""From usable photos to a scene: a lean effort first, and higher ones when too few photos are registered."""
+"""From usable photos to a scene: the effort that their number asks for, and higher ones when too few are registered."""
 
 from __future__ import annotations
 
@@ -10,29 +10,27 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from splatmill.schema import MIN_PHOTOS, KnownDistance
 from splatmill.schema.quantities import counted
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.errors import SfmFailed
 from splatmill_worker.images.prepare import Prepared, prepare
+from splatmill_worker.opencv import VERSION as OPENCV_VERSION
 from splatmill_worker.scene import Scene
 from splatmill_worker.sfm import cameras, lenses, stereo
 from splatmill_worker.sfm.callbacks import OnProgress, stop_if
-from splatmill_worker.sfm.effort import solve_at
+from splatmill_worker.sfm.effort import require_features, solve_at
 from splatmill_worker.sfm.final_model import final_model
+from splatmill_worker.sfm.matching import pairs
 from splatmill_worker.sfm.model_store import is_stored, load_model, store_model
 from splatmill_worker.sfm.options import (
     EFFORTS,
     HIGH,
     LEAN,
     NEXT_EFFORT,
-    PANORAMA_SIDE,
     STANDARD,
     Effort,
     SfmOptions,
-    fitted,
 )
 from splatmill_worker.sfm.placed import PlacingObserver
 from splatmill_worker.sfm.run import VERSION, EffortResult, SfmRun, digest, torch_threads
@@ -42,6 +40,9 @@ from splatmill_worker.sfm.world.frame import require_photos
 
 ENOUGH_PLACED = 0.95
 """Share of the photos, reliably registered, from which no higher effort is tried (decisions: ENOUGH_PLACED)."""
+
+FEW_PHOTOS = 30
+"""Photos up to which the lean effort is not tried (decisions: FEW_PHOTOS)."""
 
 log = logging.getLogger("splatmill_worker")
 
@@ -63,7 +64,7 @@ def reconstruct(
 
     on_progress: called with the stages images, features, pairs, matching, mapping and, where points are few, stereo.
     cancelled: polled; Cancelled is raised within a fraction of a second of it turning true, except that the global
-        mapper and a bundle adjustment that are running finish first.
+        mapper, a bundle adjustment and the search of a photo for features, ten seconds for a panorama, finish first.
     observer: called with the cameras and points while the incremental mapper places them.
     known: a distance between two photos, which makes the metre the unit of the scene.
 
@@ -97,7 +98,8 @@ def reconstruct_photos(
     require_photos(known, [photo.name for photo in prepared.photos])
     stop_if(cancelled)
     folder = workdir / "sfm" / prepared.key[:24]
-    whole = folder / f"model-{digest(VERSION, stereo.VERSION, pycolmap.__version__, options)}"
+    versions = VERSION, stereo.VERSION, pycolmap.__version__, OPENCV_VERSION
+    whole = folder / f"model-{digest(*versions, options)}"
     hurried = whole.with_name(f"{whole.name}-hurried")
     for stored in [whole] if options.seconds is None else [whole, hurried]:
         if not is_stored(stored):
@@ -153,32 +155,28 @@ def _no_photo(skipped: Sequence[tuple[str, str]]) -> str:
     return f"None of the {len(skipped)} files is a usable photo, such as {name}: {reason.rstrip('.')}."
 
 
-def _efforts(options: SfmOptions, longest_side: int) -> list[Effort]:
+def _efforts(options: SfmOptions, count: int) -> list[Effort]:
     """The efforts to try, in order; a single one where the options name it or set its photo size or features."""
-    chosen = [LEAN, STANDARD, HIGH] if options.effort == "auto" else [EFFORTS[options.effort]]
+    automatic = [STANDARD, HIGH] if count <= FEW_PHOTOS else [LEAN, STANDARD, HIGH]
+    chosen = automatic if options.effort == "auto" else [EFFORTS[options.effort]]
     if options.side is not None or options.features is not None:
         chosen = chosen[:1]
-    forced = [
+    return [
         replace(effort, side=options.side or effort.side, features=options.features or effort.features)
         for effort in chosen
     ]
-    return [fitted(effort, longest_side) for effort in forced]
 
 
 def _solve(run: SfmRun) -> EffortResult:
     """The best result of the efforts that were needed."""
     best: EffortResult | None = None
+    last: EffortResult | None = None
     best_counts = 0, 0
-    longest = int(
-        np.median(
-            [
-                max(photo.width, photo.height) / (PANORAMA_SIDE if photo.is_panorama else 1.0)
-                for photo in run.prepared.photos
-            ]
-        )
-    )
-    for effort in _efforts(run.options, longest):
-        if best is not None:
+    for effort in _efforts(run.options, run.count):
+        if best is not None and last is not None:
+            if _finds_the_same(run, last, effort):
+                require_features(run, last)
+                continue
             if 2 * best_counts[0] >= run.count and not run.has_time_for(NEXT_EFFORT):
                 run.hurried = True
                 run.notes.append(
@@ -190,19 +188,30 @@ def _solve(run: SfmRun) -> EffortResult:
                 f"{best_counts[0]} of {run.count} photos were placed reliably with {best.effort.name} effort; "
                 f"{effort.name} effort was tried next."
             )
-        result = solve_at(run, effort, best)
+        last = result = solve_at(run, effort, best)
         counts = registered_counts(result.mapped)
         if best is None or counts > best_counts:
             best, best_counts = result, counts
         if best_counts[0] >= ENOUGH_PLACED * run.count:
             break
         if effort.name != LEAN.name and not result.verified:
-            break  # the standard effort has about three times the lean one's features; even more would not match
+            break  # a higher effort than the standard one would not match either
     assert best is not None  # _efforts returns at least one
     if best_counts[0] < ENOUGH_PLACED * run.count and run.has_time_for(1.0):
         best = _without_fisheyes(run, best)
     unfold(run, best)
     return _with_divided_cameras(run, best)
+
+
+def _finds_the_same(run: SfmRun, tried: EffortResult, effort: Effort) -> bool:
+    """Whether `effort` certainly finds the features of the effort that was tried, and matches the same pairs."""
+    matcher = run.options.matcher
+    all_pairs = matcher == "exhaustive" or (matcher == "auto" and run.count <= pairs.EXHAUSTIVE_UP_TO)
+    return (
+        run.reduced_side(effort) == run.reduced_side(tried.effort)
+        and all(len(each.scales) < tried.effort.features for each in tried.features)
+        and (effort.partners == tried.effort.partners or all_pairs)
+    )
 
 
 def _without_fisheyes(run: SfmRun, result: EffortResult) -> EffortResult:

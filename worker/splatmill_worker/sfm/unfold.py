@@ -78,7 +78,7 @@ def unfold(run: SfmRun, result: EffortResult) -> None:
         or any(group.is_panorama or group.is_fisheye for group in run.groups)
     ):
         return
-    database = pycolmap.Database.open(result.store.database)
+    database = pycolmap.Database.open(result.database)
     try:
         _Unfolding(run, result, result.mapped.largest, database).run()
     finally:
@@ -129,7 +129,7 @@ class _Unfolding:
             kept = [each for each in tried if registered_counts(each.mapped)[0] >= enough]
             best = min(kept, key=lambda each: len(each.contradicted), default=None)
             if best is not None and len(best.contradicted) < len(against):
-                best.database.replace(self._result.store.folder / UNFOLDED)
+                best.database.replace(self._result.database.with_name(UNFOLDED))
                 self._result.mapped, self._result.left_out = best.mapped, best.left_out
             self._note(min(leaps), len(self._result.left_out or alike), bool(self._result.left_out))
         for each in tried:
@@ -167,8 +167,8 @@ class _Unfolding:
         """The photos mapped without some pairs, from a database of this name."""
         result = self._result
         numbers = [(result.ids[first], result.ids[second]) for first, second in left_out]
-        path = result.store.folder / name
-        features.copy_without_pairs(result.store.database, path, numbers)
+        path = result.database.with_name(name)
+        features.copy_without_pairs(result.database, path, numbers)
         mapped = best_mapping(self._run, path, self._verified - left_out)
         largest = mapped.largest
         contradicted = (

@@ -12,7 +12,7 @@ from typing import Any
 import psutil
 import torch
 
-PACKAGES = ("splatmill", "splatmill-worker", "torch", "pycolmap", "numpy")
+PACKAGES = ("splatmill", "splatmill-worker", "torch", "pycolmap", "opencv-python-headless", "numpy")
 
 
 def machine() -> dict[str, Any]:

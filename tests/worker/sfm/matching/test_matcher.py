@@ -5,8 +5,8 @@ Does not prove speed, nor that true matches of photos pass.
 
 import numpy as np
 
-from splatmill_worker.sfm.features import Features
 from splatmill_worker.sfm.matching.matcher import CACHED_BYTES, MAX_ANGLE, MAX_RATIO, Matcher
+from splatmill_worker.sfm.sift import Features
 
 
 def random_features(count: int, seed: int) -> Features:

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from splatmill_worker.sfm.features import Features
 from splatmill_worker.sfm.matching import vlad
+from splatmill_worker.sfm.sift import Features
 
 
 def photo(count: int, number: int) -> Features:

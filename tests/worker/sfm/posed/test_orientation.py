@@ -18,9 +18,9 @@ from splatmill_worker.images.decode import UPRIGHT
 from splatmill_worker.images.load import load_view
 from splatmill_worker.scene import Camera, Scene, viewmat_of
 from splatmill_worker.sfm import posed
-from splatmill_worker.sfm.features import Features
 from splatmill_worker.sfm.posed.judged import orientation
 from splatmill_worker.sfm.posed.judged.searched import database_of, epipolar_errors, model_of
+from splatmill_worker.sfm.sift import Features
 from splatmill_worker.synthetic import orbit, photograph, still_life
 from tests.support.posed_sets import frame_of
 

@@ -6,14 +6,14 @@ one matrix product in torch's BLAS (decisions: EXHAUSTIVE_MATCHING).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
-from splatmill_worker.sfm.features import Features
+from splatmill_worker.sfm.sift import Features
 
 MAX_RATIO = 0.8
 """Largest angle to the nearest descriptor, as a share of the angle to the second nearest (Lowe's ratio test)."""
@@ -34,24 +34,13 @@ Matches = npt.NDArray[np.uint32]
 class Matcher:
     """Matches photos, given by their index in `features`.
 
-    max_features: use only this many features of each photo, or as many as stand for its index, those with the largest
-        scale. None uses all.
+    max_features: use only this many features of each photo, those with the largest scale. None uses all.
     """
 
-    def __init__(
-        self, features: Sequence[Features], max_features: int | Mapping[int, int] | None = None
-    ) -> None:
+    def __init__(self, features: Sequence[Features], max_features: int | None = None) -> None:
         self._features = features
         counts = [len(photo.scales) for photo in features]
-        limits = (
-            max_features
-            if isinstance(max_features, Mapping)
-            else dict.fromkeys(range(len(counts)), max_features)
-        )
-        self._most = [
-            count if (limit := limits[index]) is None else min(count, limit)
-            for index, count in enumerate(counts)
-        ]
+        self._most = [count if max_features is None else min(count, max_features) for count in counts]
         most = max([1, *self._most])
         # Two are compared at a time in each thread.
         self._directions = lru_cache(max(2, CACHED_BYTES // (most * 128 * 4)))(self._directions_of)

@@ -13,9 +13,9 @@ import numpy.typing as npt
 
 from splatmill_worker.images.prepare import UsablePhoto
 from splatmill_worker.sfm.callbacks import stop_if
-from splatmill_worker.sfm.features import Features
 from splatmill_worker.sfm.matching.matcher import Matcher
 from splatmill_worker.sfm.matching.vlad import similarities
+from splatmill_worker.sfm.sift import Features
 
 Pair = tuple[int, int]
 """Indices of two photos, the smaller one first."""

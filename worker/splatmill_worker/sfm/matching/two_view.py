@@ -11,10 +11,10 @@ import numpy.typing as npt
 
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.sfm.callbacks import stop_if
-from splatmill_worker.sfm.features import Features
 from splatmill_worker.sfm.matching.matcher import Matcher, Matches
 from splatmill_worker.sfm.matching.pairs import Pair
-from splatmill_worker.sfm.options import PANORAMA_FEATURES, PANORAMA_SIDE
+from splatmill_worker.sfm.options import PANORAMA_SIDE
+from splatmill_worker.sfm.sift import Features
 
 MIN_INLIERS = 15
 """Inliers from which a pair counts as verified; COLMAP's default."""
@@ -87,7 +87,6 @@ def match_pairs(
     features: Sequence[Features],
     ids: dict[int, int],
     database: pycolmap.Database,
-    max_features: int,
     seed: int,
     pool: ThreadPoolExecutor,
     on_progress: Callable[[int, int], None],
@@ -98,9 +97,6 @@ def match_pairs(
     Pairs that the database has already are read, not matched again.
 
     ids: COLMAP's image id of each photo.
-    max_features: features of a photo that are matched, PANORAMA_FEATURES times as many of a panorama. COLMAP's
-        extraction keeps whole octaves and returns up to twice the number asked for, which would make matching four
-        times as slow.
     """
     cameras = {index: database.read_camera(database.read_image(ids[index]).camera_id) for index in ids}
     options = pycolmap.TwoViewGeometryOptions()
@@ -114,10 +110,7 @@ def match_pairs(
     )
     longest = round(max(sides, default=1000))
     options.ransac.max_error = max_error(longest)
-    most = {
-        index: max_features * (PANORAMA_FEATURES if cameras[index].is_spherical() else 1) for index in cameras
-    }
-    matcher = Matcher(features, most)
+    matcher = Matcher(features)
     ordered = sorted(chosen)
     found: dict[Pair, TwoView] = {}
     fresh: list[Pair] = []

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from splatmill_worker.sfm.features import Features
+from splatmill_worker.sfm.sift import Features
 
 WORDS = 32
 """Centres of the codebook; a photo's descriptor has 128 components for each."""

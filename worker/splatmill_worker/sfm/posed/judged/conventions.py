@@ -11,9 +11,9 @@ import numpy.typing as npt
 
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.scene import Camera, Source
-from splatmill_worker.sfm.features import Features
 from splatmill_worker.sfm.matching.pairs import Pair
 from splatmill_worker.sfm.posed.judged.searched import epipolar_errors
+from splatmill_worker.sfm.sift import Features
 
 Float = npt.NDArray[np.float64]
 

@@ -22,7 +22,7 @@ from splatmill_worker.scene import Scene, View, without
 from splatmill_worker.sfm.callbacks import OnProgress
 from splatmill_worker.sfm.matching import overlap, two_view
 from splatmill_worker.sfm.matching.pairs import Pair
-from splatmill_worker.sfm.options import LEAN, fitted
+from splatmill_worker.sfm.options import LEAN
 from splatmill_worker.sfm.posed.judged.searched import database_of, epipolar_errors, features_of, model_of
 from splatmill_worker.sfm.run import torch_threads
 
@@ -114,12 +114,10 @@ def _explained(
     ordered = sorted((place[first], place[second]) for first, second in pairs)
     stored = [views[index] for index in used]
     other = {number: view.other for number, view in enumerate(stored) if view.other is not None}
-    longest = max(max(view.camera.width, view.camera.height) for view in stored)
-    effort = fitted(LEAN, longest)
     errors: list[npt.NDArray[np.float64]] = []
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool, torch_threads(1):
-        searched = features_of(stored, effort, pool, on_progress, cancelled)
-        turned = features_of(list(other.values()), effort, pool, on_progress, cancelled)
+        searched = features_of(stored, LEAN, pool, on_progress, cancelled)
+        turned = features_of(list(other.values()), LEAN, pool, on_progress, cancelled)
         for upright in (False, True):
             found = list(searched)
             for number, each in zip(other, turned, strict=True) if upright else ():
@@ -132,7 +130,6 @@ def _explained(
                     features,
                     {index: index + 1 for index in range(len(found))},
                     database,
-                    effort.features,
                     seed,
                     pool,
                     lambda done, total: on_progress("matching", done, total, "pairs matched"),

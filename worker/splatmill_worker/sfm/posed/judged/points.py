@@ -18,6 +18,7 @@ import numpy as np
 
 from splatmill.files import replacing
 from splatmill_worker.colmap import pycolmap
+from splatmill_worker.opencv import VERSION as OPENCV_VERSION
 from splatmill_worker.scene import PointViews, Scene, Source
 from splatmill_worker.sfm import stereo
 from splatmill_worker.sfm.callbacks import OnProgress
@@ -28,7 +29,7 @@ from splatmill_worker.sfm.posed.judged.evidence import Evidence, evidence_of
 from splatmill_worker.sfm.posed.judged.triangulation import Triangulated, contradicted, triangulate
 from splatmill_worker.sfm.posed.judged.uncolored import seen_in
 
-VERSION = 2
+VERSION = 3
 """Version of the method; points stored under another version are searched for anew."""
 
 LEAST_POINTS = 20
@@ -349,7 +350,7 @@ def _load(path: Path) -> Triangulated:
 def _digest(scene: Scene) -> str:
     """A name for everything that found points depend on: the method, cameras, known points and masks."""
     digest = hashlib.sha256(
-        repr((VERSION, stereo.VERSION, pycolmap.__version__, scene.points.shape)).encode()
+        repr((VERSION, stereo.VERSION, pycolmap.__version__, OPENCV_VERSION, scene.points.shape)).encode()
     )
     digest.update(scene.points.tobytes())
     for view in scene.views:

@@ -6,17 +6,19 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from threading import BoundedSemaphore
 
 import numpy as np
 import numpy.typing as npt
 
 from splatmill_worker.colmap import pycolmap
-from splatmill_worker.images.load import Photo, load_view
+from splatmill_worker.images.load import Photo, load_view, training_size
 from splatmill_worker.scene import Camera, View
+from splatmill_worker.sfm import sift
 from splatmill_worker.sfm.callbacks import OnProgress, stop_if
-from splatmill_worker.sfm.features import Features
 from splatmill_worker.sfm.matching import pairs
 from splatmill_worker.sfm.options import Effort
+from splatmill_worker.sfm.sift import Features
 
 Float = npt.NDArray[np.float64]
 
@@ -49,47 +51,38 @@ def features_of(
     cancelled: Callable[[], bool],
 ) -> list[Searched]:
     """The features of every photo that lie on unmasked, opaque pixels. Raises Cancelled between two photos."""
-    options = pycolmap.FeatureExtractionOptions()
-    options.use_gpu = False
-    options.num_threads = 1
-    options.sift.max_num_features = effort.features
-    options.sift.first_octave = effort.first_octave
-    options.sift.max_num_orientations = effort.orientations
+    sizes = [training_size(view.camera.width, view.camera.height, effort.side) for view in views]
+    slots = BoundedSemaphore(
+        sift.concurrent_searches(max((width * height for width, height in sizes), default=1))
+    )
 
-    def find(view: View) -> Searched:
-        stop_if(cancelled)
-        return _found(load_view(view, effort.side, background=GREY), options)
+    def search_view(view: View) -> Searched:
+        with slots:
+            stop_if(cancelled)
+            return _searched(load_view(view, effort.side, background=GREY), effort)
 
     found = []
-    for each in pool.map(find, views):
+    for each in pool.map(search_view, views):
         found.append(each)
         on_progress("features", len(found), len(views), views[len(found) - 1].name)
     return found
 
 
-def _found(photo: Photo, options: pycolmap.FeatureExtractionOptions) -> Searched:
-    luma = np.ascontiguousarray((photo.rgb @ np.array([0.299, 0.587, 0.114]) + 0.5).astype(np.uint8))
-    extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
-    keypoints, descriptors = extractor.extract_from_uint8_array(luma)
-    place = np.array([(each.x, each.y, each.compute_scale()) for each in keypoints]).reshape(-1, 3)
-    column = place[:, 0].astype(np.int64).clip(0, photo.camera.width - 1)
-    row = place[:, 1].astype(np.int64).clip(0, photo.camera.height - 1)
-    kept = np.ones(len(place), bool)
+def _searched(photo: Photo, effort: Effort) -> Searched:
+    luma = (photo.rgb @ np.array([0.299, 0.587, 0.114]) + 0.5).astype(np.uint8)
+    shown = np.full(luma.shape, 255, np.uint8)
     if photo.mask is not None:
-        kept &= photo.mask[row, column]
+        shown[~photo.mask] = 0
     if photo.alpha is not None:
-        kept &= photo.alpha[row, column] >= OPAQUE
-    # A feature of several orientations would be several observations of one point.
-    _, first = np.unique(place, axis=0, return_index=True)
-    kept &= np.isin(np.arange(len(place)), first)
+        shown[photo.alpha < OPAQUE] = 0
+    mask = None if shown.all() else shown
+    # A place with several orientations would be several observations of one point.
+    features = sift.find(luma, mask, effort.features, one_orientation=True)
+    column, row = features.points.astype(np.int64).T
     return Searched(
         photo.camera,
-        Features(
-            place[kept, :2],
-            place[kept, 2].astype(np.float32),
-            np.asarray(descriptors.data, np.uint8).reshape(-1, 128)[kept],
-        ),
-        photo.rgb[row[kept], column[kept]],
+        features,
+        photo.rgb[row, column],
         photo.alpha is not None and bool((photo.alpha < 255).any()),
     )
 

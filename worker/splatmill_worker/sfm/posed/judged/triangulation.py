@@ -17,12 +17,12 @@ import numpy.typing as npt
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.scene import Camera, Source, View
 from splatmill_worker.sfm.callbacks import OnProgress, watched
-from splatmill_worker.sfm.features import Features
 from splatmill_worker.sfm.matching import overlap, pairs, two_view
-from splatmill_worker.sfm.options import Effort, fitted
+from splatmill_worker.sfm.options import Effort
 from splatmill_worker.sfm.posed.judged.conventions import better
 from splatmill_worker.sfm.posed.judged.searched import database_of, epipolar_errors, features_of, model_of
 from splatmill_worker.sfm.run import torch_threads
+from splatmill_worker.sfm.sift import Features
 
 Float = npt.NDArray[np.float64]
 
@@ -100,7 +100,7 @@ def triangulate(
     longest = max(max(view.camera.width, view.camera.height) for view in views)
     with ThreadPoolExecutor(threads) as pool, torch_threads(1), tempfile.TemporaryDirectory() as folder:
         started = perf_counter()
-        found = features_of(views, fitted(effort, longest), pool, on_progress, cancelled)
+        found = features_of(views, effort, pool, on_progress, cancelled)
         seconds["features"] = perf_counter() - started
         started = perf_counter()
         cameras = [each.camera for each in found]
@@ -113,7 +113,6 @@ def triangulate(
                 features,
                 {index: index + 1 for index in range(len(views))},
                 database,
-                effort.features,
                 seed,
                 pool,
                 lambda done, total: on_progress("matching", done, total, "pairs matched"),
