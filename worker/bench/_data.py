@@ -14,5 +14,6 @@ FOLDERS = {
     "beer": "beer_720",
     "snowmiku": "snowmiku_1008",
     "unrelated": "failure_unrelated_640",
+    "room": "room_464",
     "rotation": "failure_pure_rotation",
 }

@@ -56,7 +56,7 @@ from splatmill_worker.sfm.posed.files import ImageFiles
 from splatmill_worker.synthetic import textures
 
 Float = npt.NDArray[np.float64]
-NAMES = ("fox", "lund", "kermit", "beer", "snowmiku", "unrelated", "rotation")
+NAMES = ("fox", "lund", "kermit", "beer", "snowmiku", "room", "unrelated", "rotation")
 FOLDERS = {name: _data.FOLDERS[name] for name in NAMES}
 MISPLACED = ("beer",)  # cameras that came with the capture are wrong
 COUNTS = (25, 50, 100, 200, 500)
