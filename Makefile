@@ -16,8 +16,10 @@ PARTS := constraints.txt $(wildcard */pyproject.toml) client/splatmill/__init__.
 # The tests run in this many processes, a file in one process. They wait for servers and browsers a third of the time, so there
 # are three more than cores.
 WORKERS ?= $(shell echo $$(($$(getconf _NPROCESSORS_ONLN) + 3)))
-# A Redis of this machine, with which the tests of the service run once more.
+# A Redis of this machine, and the tests that run once more with it. They send every command and script that the tests of the service
+# send, in a third of the time.
 REDIS ?= $(shell command -v redis-server valkey-server | head -n 1)
+REDIS_TESTS := tests/server/jobs tests/worker/service tests/service/test_up.py tests/service/test_kills.py
 # Bytecode is kept, whatever the shell asks for: the tests start hundreds of processes, and each would compile its imports again.
 PYTEST := env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
@@ -41,9 +43,9 @@ ifeq ($(PYTEST_ARGS),)
 	@test -z "$(REDIS)" || $(MAKE) redis
 endif
 
-redis: $(VENV)/.installed-dev ## run the tests of the service once more, with the Redis on PATH
+redis: $(VENV)/.installed-dev ## run the tests of the queue once more, with the Redis on PATH
 	@test -n "$(REDIS)" || { echo "No redis-server or valkey-server is on PATH (Debian: apt-get install redis-server)."; exit 1; }
-	SPLATMILL_REDIS_SERVER="$(REDIS)" $(PYTEST) $(or $(PYTEST_ARGS),tests/server tests/service tests/worker/service)
+	SPLATMILL_REDIS_SERVER="$(REDIS)" $(PYTEST) $(or $(PYTEST_ARGS),$(REDIS_TESTS))
 
 fresh: ## make a bare Debian, and run `make demo` and `make test` there (as root; some 40 minutes)
 	.ci/fresh

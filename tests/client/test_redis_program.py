@@ -2,7 +2,7 @@
 cannot read the data; and which versions have faults in Lua.
 
 The programs here are scripts that print a version. Not proved here: that each of these versions serves the service; the
-tests of the service run with the wheel's, and `make redis` with that of the machine.
+tests of the service run with the wheel's, and `make redis` runs those of the queue with that of the machine.
 """
 
 from pathlib import Path
