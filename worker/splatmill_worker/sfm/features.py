@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
-from threading import BoundedSemaphore
 
 import numpy as np
 import numpy.typing as npt
@@ -26,7 +25,7 @@ from splatmill_worker.scene import MIN_SHOWN
 from splatmill_worker.sfm.callbacks import OnProgress, stop_if
 from splatmill_worker.sfm.cameras import CameraGroup
 from splatmill_worker.sfm.options import FISHEYE, PANORAMA_FEATURES, PANORAMA_SIDE, Effort
-from splatmill_worker.sfm.sift import Features, concurrent_searches, find
+from splatmill_worker.sfm.sift import Features, find, search_slots
 
 MAX_IMAGES = 2147483647
 """COLMAP's kMaxNumImages: it numbers the pair of images a < b as MAX_IMAGES * a + b."""
@@ -58,10 +57,9 @@ def extract(
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     sides = [round(effort.side * (PANORAMA_SIDE if group.is_panorama else 1.0)) for group in groups]
-    sizes = [
+    slots = search_slots(
         training_size(group.width, group.height, side) for group, side in zip(groups, sides, strict=True)
-    ]
-    slots = BoundedSemaphore(concurrent_searches(max(width * height for width, height in sizes)))
+    )
 
     def search_photo(photo: UsablePhoto, side: int, most: int) -> Features:
         with slots:

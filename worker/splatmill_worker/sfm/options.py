@@ -10,8 +10,8 @@ from typing import Literal
 class SfmOptions:
     """Options of structure from motion; `auto` is decided from the photos and their matches.
 
-    effort: how thoroughly features are searched for and matched; `auto` starts lean, or with
-        the standard effort where photos are few, and raises it where needed.
+    effort: how thoroughly features are searched for and matched; `auto` starts lean, or with the
+        standard effort where photos are few, and raises it where needed.
     matcher: how pairs of photos are chosen.
     mapper: which of COLMAP's mappers estimates the poses.
     side: longest side of the photos that features are found on, in pixels; None: by the effort.
@@ -62,7 +62,7 @@ HIGH = Effort("high", side=1400, features=6000, partners=16)
 EFFORTS = {effort.name: effort for effort in (LEAN, STANDARD, HIGH)}
 
 NEXT_EFFORT = 3.0
-"""Time of an effort over that of all before it, nearly at most (decisions: FEW_PHOTOS)."""
+"""Longest time of an effort over that of all before it, rounded (decisions: FEW_PHOTOS)."""
 
 FISHEYE = "SIMPLE_RADIAL_FISHEYE"
 """COLMAP's camera model by which photos of a fisheye lens are mapped."""

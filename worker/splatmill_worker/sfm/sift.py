@@ -7,7 +7,9 @@ everyone should know to improve object retrieval", CVPR 2012).
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from threading import BoundedSemaphore
 
 import numpy as np
 import numpy.typing as npt
@@ -48,6 +50,11 @@ class Features:
 def concurrent_searches(pixels: int) -> int:
     """How many pictures of that many pixels may be searched at a time, at least one."""
     return max(1, int(MEMORY_SHARE * memory.available() / (BYTES_PER_PIXEL * pixels)))
+
+
+def search_slots(sizes: Iterable[tuple[int, int]]) -> BoundedSemaphore:
+    """A slot for each search that may run at a time, of pictures of these widths and heights."""
+    return BoundedSemaphore(concurrent_searches(max((width * height for width, height in sizes), default=1)))
 
 
 def find(

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from threading import BoundedSemaphore
 
 import numpy as np
 import numpy.typing as npt
@@ -51,9 +50,8 @@ def features_of(
     cancelled: Callable[[], bool],
 ) -> list[Searched]:
     """The features of every photo that lie on unmasked, opaque pixels. Raises Cancelled between two photos."""
-    sizes = [training_size(view.camera.width, view.camera.height, effort.side) for view in views]
-    slots = BoundedSemaphore(
-        sift.concurrent_searches(max((width * height for width, height in sizes), default=1))
+    slots = sift.search_slots(
+        training_size(view.camera.width, view.camera.height, effort.side) for view in views
     )
 
     def search_view(view: View) -> Searched:
