@@ -74,7 +74,8 @@ def test_the_frames_have_the_colours_of_sdr(made: Path, name: str, tmp_path: Pat
 
 @pytest.mark.slow
 def test_the_cameras_are_those_of_the_frames(made: Path, tmp_path: Path) -> None:
-    """Rotations to a quarter of a degree after one common rotation, and square pixels from others in the file."""
+    """Rotations after one common rotation, and square pixels from others in the file. Pixels taken for square turn
+    cameras by 9 degrees; those at the ends of the path, which see least, are up to 0.3 off when all is right."""
     options = sfm.SfmOptions(stereo=False)
     scene = sfm.reconstruct(
         only(made, "anamorphic.mp4", tmp_path),
@@ -91,7 +92,9 @@ def test_the_cameras_are_those_of_the_frames(made: Path, tmp_path: Path) -> None
     u, _, v = np.linalg.svd(np.einsum("nji,njk->ik", found, truth))
     common = u @ np.diag([1, 1, np.linalg.det(u @ v)]) @ v
     cosines = (np.einsum("nij,jk,nik->n", found, common, truth) - 1) / 2
-    assert np.degrees(np.arccos(np.clip(cosines, -1, 1))).max() < 0.25
+    errors = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+    assert np.median(errors) < 0.2
+    assert errors.max() < 1.0
     camera = scene.views[0].camera
     assert (camera.width, camera.height) == (384, 288)
     assert camera.fx == pytest.approx(camera.fy, rel=0.01)
