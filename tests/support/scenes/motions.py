@@ -11,7 +11,7 @@ FOCAL, WIDTH, HEIGHT = 400.0, 480, 360
 """The true camera, in pixels."""
 
 POINTS, OBSERVED = 300, 100
-"""Points of the scene, and those that a photo observes at most."""
+"""Points of the scene, and those that a photo observes at most where nothing else is asked for."""
 
 Motion = Callable[[float], tuple[list[float], list[float]]]
 """Where the camera is, and which point it faces, at a time from 0 to 1."""
@@ -49,11 +49,17 @@ def look(eye: list[float], target: list[float]) -> np.ndarray:
 
 
 def model_of(
-    motion: Motion, focal: float, few: int = 0, count: int = 36, focals: tuple[float, ...] = (FOCAL,)
+    motion: Motion,
+    focal: float,
+    few: int = 0,
+    count: int = 36,
+    focals: tuple[float, ...] = (FOCAL,),
+    observed: int = OBSERVED,
 ) -> pycolmap.Reconstruction:
     """A model of photos along `motion` whose camera starts with `focal`; the `few` first have another such camera.
 
     focals: the true focal lengths, of photos in turn.
+    observed: points that a photo observes at most.
     """
     rng = np.random.default_rng(0)
     points = rng.uniform(-1, 1, (POINTS, 3))
@@ -72,7 +78,7 @@ def model_of(
         pixels = focals[number % len(focals)] * local[:, :2] / local[:, 2:] + [WIDTH / 2, HEIGHT / 2]
         pixels += rng.normal(0, 0.33, (POINTS, 2))
         seen = np.flatnonzero(((pixels > 0) & (pixels < [WIDTH, HEIGHT])).all(1) & (local[:, 2] > 0))
-        keep = rng.permutation(seen)[:OBSERVED]
+        keep = rng.permutation(seen)[:observed]
         image = pycolmap.Image(
             name=f"{number:06d}.png",
             keypoints=pixels[keep],

@@ -14,7 +14,8 @@ from splatmill_worker.errors import SfmFailed
 from splatmill_worker.sfm import checks, features
 from splatmill_worker.sfm.cameras import CameraGroup
 from splatmill_worker.sfm.effort import registered_photos
-from splatmill_worker.sfm.mapping import adjust, mapper
+from splatmill_worker.sfm.mapping import adjust, mapper, precise
+from splatmill_worker.sfm.mapping.registered import registered
 from splatmill_worker.sfm.run import EffortResult, SfmRun
 from splatmill_worker.sfm.world.frame import places_of
 from splatmill_worker.sfm.world.position_priors import position_priors
@@ -58,7 +59,7 @@ def final_model(run: SfmRun, result: EffortResult) -> FinalModel:
         features.photo_index(model.images[image_id].name): reason for image_id, reason in deregistered.items()
     }
     with run.clock("polish"):
-        model, warnings = _adjusted(run, model, fixed)
+        model, warnings = _polished(run, result, model, fixed)
     facts |= checks.model_facts(model, run.count)
     checks.require_usable(facts)
     facts["features_per_photo"] = float(np.median([len(found.scales) for found in result.features]))
@@ -106,10 +107,37 @@ def _with_plausible_intrinsics(
     return again, again.largest, True
 
 
+def _polished(
+    run: SfmRun, result: EffortResult, model: pycolmap.Reconstruction, fixed: bool
+) -> tuple[pycolmap.Reconstruction, tuple[str, ...]]:
+    """The registered photos after the last bundle adjustment, and warnings about their lenses.
+
+    Small features place the cameras, and then the points of all features are adjusted.
+    """
+    model = registered(model)
+    scales = {
+        image_id: result.features[features.photo_index(model.images[image_id].name)].scales
+        for image_id in model.reg_image_ids()
+    }
+    small = precise.without_large_features(model, scales)
+    if small is None:
+        return _adjusted(run, model, fixed)
+    small, warnings = _adjusted(run, small, fixed)
+    precise.take_cameras(model, small)
+    adjust.bundle_adjust(
+        model,
+        run.threads,
+        fixed_cameras=True,
+        cancelled=run.cancelled,
+        on_iterations=_reporter(run, model, f"{model.num_points3D()} points"),
+    )
+    return model, warnings
+
+
 def _adjusted(
     run: SfmRun, model: pycolmap.Reconstruction, fixed: bool
 ) -> tuple[pycolmap.Reconstruction, tuple[str, ...]]:
-    """The model after the last bundle adjustment, in which GPS takes part, and warnings about its lenses.
+    """The model after a bundle adjustment in which GPS takes part, and warnings about its lenses.
 
     `model` is changed, and may be left in metres. Where an adjustment makes the photos agree much better with GPS,
     another one follows, with priors of the smaller error.
@@ -191,14 +219,13 @@ def _solved(
     return adjusted.model, tuple(_assumption(groups[camera]) for camera in sorted(adjusted.assumed))
 
 
-def _reporter(run: SfmRun, model: pycolmap.Reconstruction) -> Callable[[int], None]:
-    """Reports the iterations of an adjustment of `model`."""
+def _reporter(run: SfmRun, model: pycolmap.Reconstruction, what: str = "") -> Callable[[int], None]:
+    """Reports the iterations of an adjustment of `what`; where it is empty, of the cameras of `model`."""
     placed = model.num_reg_images()
+    what = what or f"{placed} cameras and their lenses"
 
     def report(iterations: int) -> None:
-        run.on_mapping(
-            placed, run.count, f"adjusting {placed} cameras and their lenses, iteration {iterations + 1}"
-        )
+        run.on_mapping(placed, run.count, f"adjusting {what}, iteration {iterations + 1}")
 
     return report
 

@@ -84,6 +84,7 @@ def flight(curvature: float) -> tuple[pycolmap.Reconstruction, Float]:
         if len(elements) >= 3:
             track = pycolmap.Track([pycolmap.TrackElement(*element) for element in elements])
             model.add_point3D(bulged(points[[point]])[0], track, np.zeros(3, np.uint8))
+    model.update_point_3d_errors()
     return model, centers
 
 

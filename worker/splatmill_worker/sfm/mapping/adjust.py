@@ -287,14 +287,16 @@ def bundle_adjust(
     model: pycolmap.Reconstruction,
     threads: int,
     *,
+    fixed_cameras: bool = False,
     fixed_intrinsics: bool = False,
     fixed_focal: bool = False,
     priors: Sequence[pycolmap.PosePrior] = (),
     cancelled: Callable[[], bool],
     on_iterations: Callable[[int], None] = lambda done: None,
 ) -> None:
-    """Adjust all poses, points and (unless fixed) lenses to convergence, with a robust loss, in place.
+    """Adjust all poses, points and lenses (unless fixed) to convergence, with a robust loss, in place.
 
+    fixed_cameras: keep poses, focal lengths and distortion.
     fixed_intrinsics: keep focal lengths and distortion.
     fixed_focal: keep focal lengths.
     priors: positions of photos that are observations too, in the world of `model`.
@@ -303,8 +305,9 @@ def bundle_adjust(
     Raises Cancelled between iterations, as often, when the caller has asked to stop.
     """
     options = _options(threads)
-    options.refine_extra_params = not fixed_intrinsics
-    options.refine_focal_length = not fixed_intrinsics and not fixed_focal
+    options.refine_rig_from_world = not fixed_cameras
+    options.refine_extra_params = not fixed_cameras and not fixed_intrinsics
+    options.refine_focal_length = options.refine_extra_params and not fixed_focal
     at_once = iterations_at_once(model, MAX_ITERATIONS)
     options.ceres.solver_options.max_num_iterations = at_once
     radius = FIRST_RADIUS

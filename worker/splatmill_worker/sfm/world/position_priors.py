@@ -15,9 +15,12 @@ from splatmill_worker.colmap import pycolmap
 from splatmill_worker.scene import Float
 from splatmill_worker.sfm.world import geodesy, georeference
 
-PHOTOS_PER_ERROR = 30
-"""Photos that are assumed to share one error of GPS, which changes over minutes. The variance of each prior is
-multiplied by it (decisions: position-priors)."""
+PHOTOS_PER_ERROR = 3
+"""Photos that count as one, since the error of GPS changes slowly. The variance of each prior is multiplied by it
+(decisions: position-priors)."""
+
+LEAST_PIXELS = 0.05
+"""Error of an observation in pixels, at least, against which that of GPS is weighed."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +29,8 @@ class PositionPriors:
 
     to_metres: from the world of the model to metres to the east, to the north and upwards.
     priors: of each photo whose position agrees with the others, in those metres.
-    error: standard deviation of a coordinate of one of them, in metres, at least georeference.GPS_ERROR.
+    error: standard deviation of a coordinate of one of them, in metres, at least georeference.GPS_ERROR. The covariance
+        of a prior is larger, for the solver takes the standard deviation of an observation for one pixel.
     """
 
     to_metres: pycolmap.Sim3d
@@ -35,7 +39,7 @@ class PositionPriors:
 
 
 def position_priors(model: pycolmap.Reconstruction, places: Mapping[int, Float]) -> PositionPriors | None:
-    """The priors of the registered photos of `model`.
+    """The priors of the registered photos of `model`, whose points hold their reprojection errors.
 
     places: latitude and longitude in degrees and altitude in metres, float64 [3], of each photo by its image's id; not
         finite where the photo has none.
@@ -56,7 +60,8 @@ def position_priors(model: pycolmap.Reconstruction, places: Mapping[int, Float])
     fit = georeference.fit(centers, metres)
     if isinstance(fit, str) or georeference.down_by(fit) is None:
         return None
-    covariance = PHOTOS_PER_ERROR * fit.error**2 * np.eye(3)
+    pixels = max(LEAST_PIXELS, model.compute_mean_reprojection_error())
+    covariance = PHOTOS_PER_ERROR * (fit.error / pixels) ** 2 * np.eye(3)
     priors = tuple(
         pycolmap.PosePrior(
             corr_data_id=model.images[image].data_id,

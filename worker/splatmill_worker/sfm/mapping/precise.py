@@ -1,0 +1,105 @@
+"""The observations that place cameras best, which are those of small features.
+
+The position of a feature is less certain the larger it is, and the error of a large one is more than noise: where a
+surface is seen obliquely, the middle of what a large feature shows is not where it looks to be. An adjustment weighs
+all observations alike. In a wide scene of many photos the large ones bend the lens, and with it the whole scene.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from splatmill_worker.colmap import pycolmap
+
+KEPT_OBSERVATIONS = 100
+"""Observations of a photo that are kept, those of its smallest features, however large these are (decisions:
+KEPT_OBSERVATIONS)."""
+
+Scales = Mapping[int, npt.NDArray[np.float32]]
+"""Of the features of each registered photo, by its image's id, in the order of its points."""
+
+
+def without_large_features(model: pycolmap.Reconstruction, scales: Scales) -> pycolmap.Reconstruction | None:
+    """A copy with the observations of features up to the scale that makes the estimate of the cameras most precise.
+
+    Of n observations with a mean squared error v, the variance of what is estimated is proportional to v / n. Errors
+    are those of the model as it is. A photo keeps its KEPT_OBSERVATIONS smallest ones, with all others of a point where
+    nothing else of it would be left.
+
+    None where that is all of them.
+    """
+    found = _Observations.of(model, scales)
+    first = found.rank_in_photo() < KEPT_OBSERVATIONS
+    others = np.flatnonzero(~first)
+    others = others[np.argsort(found.scale[others], kind="stable")]
+    errors = found.error[first].sum() + np.concatenate([[0.0], np.cumsum(found.error[others])])
+    count = int(np.argmin(errors / np.maximum(1, first.sum() + np.arange(len(others) + 1)) ** 2))
+    limit = found.scale[others[count - 1]] if count else -np.inf
+    kept = first | (found.scale <= limit)
+    of_point = np.bincount(found.point, kept)
+    alone = np.unique(found.point[first & (of_point[found.point] == 1)])
+    kept |= np.isin(found.point, alone)
+    if kept.all():
+        return None
+    result = copy.deepcopy(model)
+    for image_id, number in zip(found.photo[~kept].tolist(), found.number[~kept].tolist(), strict=True):
+        if result.images[image_id].points2D[number].has_point3D():
+            result.delete_observation(image_id, number)
+    result.update_point_3d_errors()
+    return result
+
+
+def take_cameras(model: pycolmap.Reconstruction, adjusted: pycolmap.Reconstruction) -> None:
+    """Give `model`, in place, the lenses, poses and points of a copy without some of its observations."""
+    for camera_id, camera in adjusted.cameras.items():
+        model.cameras[camera_id].model, model.cameras[camera_id].params = camera.model, camera.params
+    for image_id in adjusted.reg_image_ids():
+        image = model.images[image_id]
+        model.frames[image.frame_id].rig_from_world = adjusted.images[image_id].cam_from_world()
+    for point_id, point in adjusted.points3D.items():
+        model.points3D[point_id].xyz = point.xyz
+
+
+@dataclass(frozen=True)
+class _Observations:
+    """All observations of a model: the image's id, the feature's number in it, the point's id, the feature's scale, and
+    the squared error in pixels as the loss of the adjustment counts it. All [n]."""
+
+    photo: npt.NDArray[np.int64]
+    number: npt.NDArray[np.int64]
+    point: npt.NDArray[np.int64]
+    scale: npt.NDArray[np.float32]
+    error: npt.NDArray[np.float64]
+
+    @classmethod
+    def of(cls, model: pycolmap.Reconstruction, scales: Scales) -> _Observations:
+        photos, numbers, points, sizes, errors = [], [], [], [], []
+        for image_id in sorted(model.reg_image_ids()):
+            image = model.images[image_id]
+            seen = [(k, point) for k, point in enumerate(image.points2D) if point.has_point3D()]
+            at = np.array([k for k, _ in seen], np.int64)
+            ids = [point.point3D_id for _, point in seen]
+            places = np.array([model.points3D[each].xyz for each in ids]).reshape(-1, 3)
+            shown = model.cameras[image.camera_id].img_from_cam(image.cam_from_world() * places)
+            offsets = shown - np.array([point.xy for _, point in seen]).reshape(-1, 2)
+            squared = np.nan_to_num(
+                (offsets**2).sum(axis=1)
+            )  # behind the camera, where the solver counts nothing
+            photos.append(np.full(len(seen), image_id))
+            numbers.append(at)
+            points.append(np.array(ids, np.int64))
+            sizes.append(scales[image_id][at])
+            errors.append(2.0 * (np.sqrt(1.0 + squared) - 1.0))
+        return cls(*(np.concatenate(each) for each in (photos, numbers, points, sizes, errors)))
+
+    def rank_in_photo(self) -> npt.NDArray[np.int64]:
+        """How many smaller features the same photo observes."""
+        order = np.lexsort((self.scale, self.photo))
+        rank = np.empty(len(order), np.int64)
+        rank[order] = np.arange(len(order)) - np.searchsorted(self.photo[order], self.photo[order])
+        return rank
