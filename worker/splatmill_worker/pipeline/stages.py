@@ -78,7 +78,7 @@ def run(
         emit(PlanEvent(plan=planned.plan.as_dict()))
         photos = planned_photos(job, cameras, planned, stages)
         plan = planned.plan
-        first = seeded(planned.first, cameras, photos, plan)
+        first = seeded(job, planned.first, cameras, photos, plan)
         engine = open_engine(
             first,
             plan.kernels,

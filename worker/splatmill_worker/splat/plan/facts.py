@@ -27,7 +27,7 @@ from splatmill_worker.splat.views import TrainingView
 Float = npt.NDArray[np.float64]
 
 SOME_VIEWS = 50
-"""Photos, evenly chosen, that are enough for the median of what photos have in view."""
+"""Photos, evenly chosen, that are enough for a median over photos; up to twice as many are taken."""
 
 LIBRARIES = 200 * 10**6
 """Resident pages of the files of COLMAP, torch and the other libraries, bytes."""
@@ -198,7 +198,7 @@ def measure(scene: Scene, views: Sequence[TrainingView], held_out: int, speed: S
         masked=sum(view.full.mask is not None for view in views),
         distorted=sum(view.lens is not None for view in scene.views),
         faces=sum(view.face is not None for view in scene.views),
-        halving_loss=float(np.median([halving_loss(view.full.rgb) for view in views])),
+        halving_loss=float(np.median([halving_loss(view.full.rgb) for view in _some(views)])),
         light=None if seen is None else compared(seen, views),
         geometry=None
         if seen is None
@@ -252,10 +252,14 @@ def _coverage(scene: Scene, views: Sequence[TrainingView]) -> Coverage | None:
 
 
 def _in_view(scene: Scene, views: Sequence[TrainingView]) -> float:
-    """Median, over up to twice SOME_VIEWS photos, of the share of up to twice MAX_POINTS points within their frames."""
+    """Median, over some photos, of the share of up to twice MAX_POINTS points within their frames."""
     points = scene.points[:: max(1, len(scene.points) // MAX_POINTS)]
-    some = views[:: max(1, len(views) // SOME_VIEWS)]
-    return float(np.median([view.full.camera.project(points).inside.mean() for view in some]))
+    return float(np.median([view.full.camera.project(points).inside.mean() for view in _some(views)]))
+
+
+def _some(views: Sequence[TrainingView]) -> Sequence[TrainingView]:
+    """SOME_VIEWS photos, evenly chosen, and at most twice as many."""
+    return views[:: max(1, len(views) // SOME_VIEWS)]
 
 
 def _extent(scene: Scene, views: Sequence[TrainingView]) -> float:
