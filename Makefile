@@ -17,13 +17,12 @@ PARTS := constraints.txt $(wildcard */pyproject.toml) client/splatmill/__init__.
 # are three more than cores.
 WORKERS ?= $(shell echo $$(($$(getconf _NPROCESSORS_ONLN) + 3)))
 # A Redis of this machine, and the tests that run once more with it. They send every command and script that the tests of the service
-# send, in a third of the time. With ONCE=1 `make test` leaves them to `make redis`, so that both can run beside each other.
+# send, in a third of the time.
 REDIS ?= $(shell command -v redis-server valkey-server | head -n 1)
 REDIS_TESTS := tests/server/jobs tests/worker/service tests/service/test_up.py tests/service/test_kills.py
-ONCE ?=
-# Bytecode is kept, whatever the shell asks for: the tests start hundreds of processes, and each would compile its imports again.
-# A `make` that a test starts is not part of this one.
-PYTEST = env -u PYTHONDONTWRITEBYTECODE -u MAKEFLAGS -u MAKELEVEL $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
+# Bytecode is kept, whatever the shell asks for: the tests start hundreds of processes, and each would compile its imports again. What
+# they start is no part of this `make`.
+PYTEST := env -u PYTHONDONTWRITEBYTECODE -u MAKEFLAGS $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
 .PHONY: FORCE help install demo quick test redis fresh coverage check ruff types rules mutants generated wheels docs screenshots walk pictures bench soak capacity fleet load abuse fuzz serve sanitize clean
 
@@ -40,12 +39,11 @@ quick: $(VENV)/.installed-dev ## run the tests that most changes need (not those
 	$(PYTEST) -m "not slow" $(PYTEST_ARGS)
 
 test: $(VENV)/.installed-dev ## run all tests (PYTEST_ARGS="..." chooses)
-	$(PYTEST) $(if $(ONCE),$(REDIS_TESTS:%=--ignore=%)) $(PYTEST_ARGS)
-ifeq ($(PYTEST_ARGS)$(ONCE),)
+	$(PYTEST) $(PYTEST_ARGS)
+ifeq ($(PYTEST_ARGS),)
 	@test -z "$(REDIS)" || $(MAKE) redis
 endif
 
-redis: WORKERS = 3
 redis: $(VENV)/.installed-dev ## run the tests of the queue once more, with the Redis on PATH
 	@test -n "$(REDIS)" || { echo "No redis-server or valkey-server is on PATH (Debian: apt-get install redis-server)."; exit 1; }
 	SPLATMILL_REDIS_SERVER="$(REDIS)" $(PYTEST) $(or $(PYTEST_ARGS),$(REDIS_TESTS))

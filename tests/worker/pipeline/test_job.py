@@ -64,6 +64,9 @@ def test_a_posed_capture_becomes_a_model_with_its_reports(whole: Run) -> None:
     compared = [event for event in progress if event.stage == "evaluation"]
     assert progress[-len(compared) :] == compared
     assert [(event.done, event.total) for event in compared] == [(1, 2), (2, 2)]
+    # With a thousand photos, each part between their loading and the first step takes seconds.
+    loading = [event.note for event in progress if event.stage == "loading"]
+    assert loading[-2:] == ["comparing the light of the photos", "placing the first Gaussians"]
 
     out = outcome.out
     assert {path.name for path in out.iterdir()} == {

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from splatmill.schema import ProgressEvent, TrainOptions
+from splatmill.schema import TrainOptions
 from splatmill_worker import memory
 from splatmill_worker.pipeline.cameras import Cameras
 from splatmill_worker.pipeline.given_points import points_path, start_path
@@ -86,8 +86,8 @@ def _doubt_message(start: GivenModel) -> str:
 
 def seeded(job: Job, first: First, cameras: Cameras, photos: Photos, plan: Plan) -> Gaussians:
     """The first Gaussians within the plan's limit, with what the plan adds to those made from points."""
-    count = len(photos.training) + len(photos.held_out)
-    job.emit(ProgressEvent(stage="loading", done=count, total=count, note="placing the first Gaussians"))
+    tell = photos.reporter(job.emit)
+    tell("placing the first Gaussians")
     if isinstance(first.hull, Hull):
         added = at_first(len(first.hull.points), plan.max_gaussians)
         gaussians = first.hull.gaussians(added, cameras.world.points, cameras.world.colors)
@@ -102,6 +102,7 @@ def seeded(job: Job, first: First, cameras: Cameras, photos: Photos, plan: Plan)
         fill_gaps=plan.gaps,
         add_far_shell=plan.far_shell,
         max_gaussians=plan.max_gaussians,
+        tell=tell,
     )
 
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from splatmill.schema import ProgressEvent
 from splatmill_worker import memory
 from splatmill_worker.images.load import load_views, training_size
 from splatmill_worker.images.pixel_files import PixelFiles
@@ -40,6 +41,15 @@ class Photos:
     def shown(self) -> TrainingView:
         """The view of previews and of the progress film: a held-out one where there is any."""
         return (self.held_out or self.training)[0]
+
+    def reporter(self, emit: Emit) -> Callable[[str], None]:
+        """A function that reports, by a note, what is done with the photos once all are loaded."""
+        count = len(self.training) + len(self.held_out)
+
+        def tell(note: str) -> None:
+            emit(ProgressEvent(stage="loading", done=count, total=count, note=note))
+
+        return tell
 
     def relit(self, light: Light) -> Photos:
         """The photos, with those to train on brought to the light of the photos around them.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from splatmill.schema import ProgressEvent, Switch
+from splatmill.schema import Switch
 from splatmill_worker.errors import Refusal
 from splatmill_worker.kernels.gpu.device import describe
 from splatmill_worker.pipeline.cameras import Cameras
@@ -100,9 +100,7 @@ def _measure_facts(job: Job, cameras: Cameras, photos: Photos, first: First) -> 
     pixels = photos.training[0].full.rgb[..., 0].numel()
     most = resolved(pixels, len(photos.training)) if first.model is None else 0
     speed = probe(open_engine(first.gaussians, job.kernels), photos.training, most=most)
-    count = len(photos.training) + len(photos.held_out)
-    job.emit(ProgressEvent(stage="loading", done=count, total=count, note="measuring what they show"))
-    facts = measure(cameras.world, photos.training, len(photos.held_out), speed)
+    facts = measure(cameras.world, photos.training, len(photos.held_out), speed, photos.reporter(job.emit))
     facts = replace(facts, start=first.model, photo_bytes=photos.size, photos_on_disk=photos.on_disk)
     if isinstance(first.hull, Hull):
         facts = replace(facts, hull_points=len(first.hull.points))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -87,23 +88,32 @@ def reprojection_errors(model: pycolmap.Reconstruction) -> dict[int, tuple[int, 
 
     The error is infinite for a photo without points, and where a point does not project.
     """
-    points = {point_id: point.xyz for point_id, point in model.points3D.items()}
     result = {}
+    for image_id, _, off in observations(model):
+        error = np.linalg.norm(off, axis=1)
+        mean = float(np.mean(error)) if len(error) and np.isfinite(error).all() else math.inf
+        result[image_id] = len(error), mean
+    return result
+
+
+def observations(
+    model: pycolmap.Reconstruction,
+) -> Iterator[tuple[int, list[pycolmap.Point2D], npt.NDArray[np.float64]]]:
+    """The id of each registered image, what it observes [n], and how far from there the model shows it, pixels [n, 2].
+
+    Not finite where a point does not project, as behind a camera.
+    """
+    points = {point_id: point.xyz for point_id, point in model.points3D.items()}
     for image_id in model.reg_image_ids():
         image = model.images[image_id]
-        observed = image.get_observation_points2D()
-        if not observed:
-            result[image_id] = 0, math.inf
-            continue
-        world = np.array([points[point.point3D_id] for point in observed])
+        observed = list(image.get_observation_points2D())
+        world = np.array([points[point.point3D_id] for point in observed]).reshape(-1, 3)
         camera = model.cameras[image.camera_id]
         projected = np.asarray(camera.img_from_cam(image.cam_from_world() * world))
-        off = projected - np.array([point.xy for point in observed])
+        off = projected - np.array([point.xy for point in observed]).reshape(-1, 2)
         if camera.is_spherical():  # whose left and right borders meet
             off[:, 0] -= camera.width * np.round(off[:, 0] / camera.width)
-        error = np.linalg.norm(off, axis=1)
-        result[image_id] = len(observed), float(np.mean(error)) if np.isfinite(error).all() else math.inf
-    return result
+        yield image_id, observed, off
 
 
 def reliably_registered(model: pycolmap.Reconstruction | None) -> set[int]:

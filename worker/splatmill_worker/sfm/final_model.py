@@ -115,6 +115,7 @@ def _polished(
     Small features place the cameras, and then the points of all features are adjusted.
     """
     model = registered(model)
+    adjust.update_errors(model)
     scales = {
         image_id: result.features[features.photo_index(model.images[image_id].name)].scales
         for image_id in model.reg_image_ids()

@@ -13,7 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from splatmill_worker.colmap import pycolmap
-from splatmill_worker.sfm.mapping import adjust, precise
+from splatmill_worker.images.lens import PANORAMA
+from splatmill_worker.sfm.checks import observations
+from splatmill_worker.sfm.mapping import adjust
 from splatmill_worker.sfm.mapping.precise import KEPT_OBSERVATIONS, take_cameras, without_large_features
 from tests.support.scenes.motions import FOCAL, HEIGHT, POINTS, WIDTH, ball, model_of
 
@@ -158,9 +160,31 @@ def test_what_a_model_hides_behind_a_camera_counts_nothing() -> None:
     assert without_large_features(model, scales) is not None
 
 
-def test_a_model_without_points_has_nothing_to_leave_out() -> None:
+def test_a_panorama_sees_across_its_border() -> None:
+    """A point whose feature is at the other border is not off by the width of the panorama."""
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(model=PANORAMA, width=800, height=400, params=[800.0, 400.0], camera_id=1)
+    )
+    points = np.random.default_rng(0).normal(0, 4, (300, 3))
+    points[:5] = [[0.0, 0.1 * k, -4.0] for k in range(5)]  # behind, where the borders meet
+    for number in range(3):
+        keypoints = np.array([model.cameras[1].img_from_cam(each) for each in points])
+        keypoints[:5, 0] = [0.1, 799.9, 0.1, 799.9, 0.1]
+        model.add_image_with_trivial_frame(
+            pycolmap.Image(name=f"{number}.png", keypoints=keypoints, camera_id=1, image_id=number + 1),
+            pycolmap.Rigid3d(),
+        )
+    for number, point in enumerate(points):
+        track = pycolmap.Track([pycolmap.TrackElement(image, number) for image in (1, 2, 3)])
+        model.add_point3D(point, track, np.zeros(3, np.uint8))
+    errors = [np.linalg.norm(off, axis=1).max() for _, _, off in observations(model)]
+    assert max(errors) < 0.2
+
+
+def test_a_model_without_points_or_photos_has_nothing_to_leave_out() -> None:
     model = model_of(ball, FOCAL)
     for point in list(model.points3D):
         model.delete_point3D(point)
     assert without_large_features(model, features_of(model, 0.4)) is None
-    assert precise.KEPT_OBSERVATIONS >= 2 * adjust.LEAST_TRACK
+    assert without_large_features(pycolmap.Reconstruction(), {}) is None

@@ -103,11 +103,17 @@ def error(model: pycolmap.Reconstruction, truth: Float) -> float:
 
 
 def adjusted(
-    model: pycolmap.Reconstruction, metres: Float, heights: Float | None = None, *, fixed: bool = False
+    model: pycolmap.Reconstruction,
+    metres: Float,
+    heights: Float | None = None,
+    *,
+    fixed: bool = False,
+    scales: list[Float] | None = None,
 ) -> tuple[pycolmap.Reconstruction, list[str]]:
     """The final model of photos whose EXIF has these places, and the notes.
 
     heights: altitudes that it has in place of the true ones; NaN: none.
+    scales: of the features of each photo; where they are left out, all have the same.
     """
     places = np.array([geodesy.place(place, LUND) for place in metres])
     if heights is not None:
@@ -122,7 +128,9 @@ def adjusted(
         prepared=SimpleNamespace(photos=photos), groups=[group], options=SfmOptions(), threads=1, notes=[],
         count=len(photos), cancelled=lambda: False, on_mapping=lambda done, total, note: reports.append(note),
     )  # fmt: skip
-    model, warnings = final_model._adjusted(run, copy.deepcopy(model), fixed)
+    scales = scales or [np.ones(len(model.images[number + 1].points2D)) for number in range(len(photos))]
+    found: Any = SimpleNamespace(features=[SimpleNamespace(scales=each) for each in scales])
+    model, warnings = final_model._polished(run, found, copy.deepcopy(model), fixed)
     assert reports
     assert not warnings
     return model, run.notes
@@ -155,6 +163,43 @@ def test_a_bulge_goes(flown: Flown, noise: str) -> None:
     # It is where it was, in its own unit, and not where GPS has it.
     assert np.abs(centers_of(result) - centers_of(model)).max() < 10.0 / UNIT
     assert [note for note in notes if note.startswith("GPS took part") and "144 positions" in note]
+
+
+def test_a_bulge_goes_where_large_features_are_wrong_and_photos_are_not_registered(flown: Flown) -> None:
+    """The points of all features follow the cameras, and those of photos that are left out are as they were."""
+    model, truth, without = flown
+    worse = copy.deepcopy(model)
+    rng = np.random.default_rng(4)
+    scales = []
+    for image in range(1, len(truth) + 1):
+        observed = worse.images[image].points2D
+        large = np.array([point.has_point3D() and point.point3D_id % 3 == 0 for point in observed])
+        for number in np.flatnonzero(large):
+            observed[int(number)].xy = observed[int(number)].xy + rng.normal(0.0, 3.0, 2)
+        scales.append(np.where(large, 9.0, 1.0))
+    for number in range(2, len(truth), 13):
+        worse.deregister_frame(worse.images[number + 1].frame_id)
+    observations = worse.compute_num_observations()
+    result, notes = adjusted(worse, truth + MEASURED, scales=scales)
+    registered = [image - 1 for image in sorted(result.reg_image_ids())]
+    assert len(registered) == len(truth) - 11
+    assert error(result, truth[registered]) < 0.6 * without
+    assert result.compute_num_observations() == observations
+    assert [note for note in notes if "133 positions" in note]
+
+
+def test_a_position_counts_for_less_the_better_photos_agree(flown: Flown) -> None:
+    model, truth, _ = flown
+    places = {number + 1: geodesy.place(place, LUND) for number, place in enumerate(truth + MEASURED)}
+    worse = copy.deepcopy(model)
+    for point in worse.points3D.values():
+        point.error *= 2.0
+    counted = [position_priors(each, places) for each in (model, worse)]
+    assert counted[0] is not None
+    assert counted[1] is not None
+    variances = [each.priors[0].position_covariance[0, 0] for each in counted if each is not None]
+    assert variances[0] == pytest.approx(4.0 * variances[1])
+    assert variances[1] > counted[1].error ** 2
 
 
 def test_a_bulge_larger_than_the_error_of_gps_goes_too(flown: Flown) -> None:

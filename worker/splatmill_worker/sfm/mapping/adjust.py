@@ -20,7 +20,8 @@ OPENCV_MIN_PHOTOS = 8
 """Registered photos of a camera from which its four OPENCV distortion coefficients are estimated."""
 
 OPENCV_MIN_OBSERVATIONS = 2000
-"""Observations of points by a camera from which its four OPENCV distortion coefficients are estimated."""
+"""Observations of points by a camera, of those that take part, from which its four OPENCV distortion coefficients are
+estimated."""
 
 STRETCH_PIXELS = 1.0
 """Standard deviation of fx / fy, as a displacement of the longer edge of the photo in pixels, up to which the two focal

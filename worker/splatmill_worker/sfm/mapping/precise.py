@@ -15,13 +15,14 @@ import numpy as np
 import numpy.typing as npt
 
 from splatmill_worker.colmap import pycolmap
+from splatmill_worker.sfm.checks import observations
 
 KEPT_OBSERVATIONS = 100
 """Observations of a photo that are kept, those of its smallest features, however large these are (decisions:
 KEPT_OBSERVATIONS)."""
 
 Scales = Mapping[int, npt.NDArray[np.float32]]
-"""Of the features of each registered photo, by its image's id, in the order of its points."""
+"""Scales [n] in pixels of the features of each registered photo, by its image's id, in the order of its points."""
 
 
 def without_large_features(model: pycolmap.Reconstruction, scales: Scales) -> pycolmap.Reconstruction | None:
@@ -31,14 +32,18 @@ def without_large_features(model: pycolmap.Reconstruction, scales: Scales) -> py
     are those of the model as it is. A photo keeps its KEPT_OBSERVATIONS smallest ones, with all others of a point where
     nothing else of it would be left.
 
-    None where that is all of them.
+    model: with registered photos; it is not changed.
+
+    None where all observations are kept.
     """
     found = _Observations.of(model, scales)
+    if found is None:
+        return None
     first = found.rank_in_photo() < KEPT_OBSERVATIONS
     others = np.flatnonzero(~first)
     others = others[np.argsort(found.scale[others], kind="stable")]
     errors = found.error[first].sum() + np.concatenate([[0.0], np.cumsum(found.error[others])])
-    count = int(np.argmin(errors / np.maximum(1, first.sum() + np.arange(len(others) + 1)) ** 2))
+    count = int(np.argmin(errors / (first.sum() + np.arange(len(others) + 1)) ** 2))
     limit = found.scale[others[count - 1]] if count else -np.inf
     kept = first | (found.scale <= limit)
     of_point = np.bincount(found.point, kept)
@@ -67,8 +72,15 @@ def take_cameras(model: pycolmap.Reconstruction, adjusted: pycolmap.Reconstructi
 
 @dataclass(frozen=True)
 class _Observations:
-    """All observations of a model: the image's id, the feature's number in it, the point's id, the feature's scale, and
-    the squared error in pixels as the loss of the adjustment counts it. All [n]."""
+    """All n observations of a model.
+
+    photo: id of the image [n].
+    number: of the feature in its photo [n].
+    point: id of the point [n].
+    scale: of the feature [n], in pixels.
+    error: squared distance from where the model shows the point [n], in pixels, as the loss of the adjustment counts
+        it; zero behind the camera, where the solver counts nothing.
+    """
 
     photo: npt.NDArray[np.int64]
     number: npt.NDArray[np.int64]
@@ -77,28 +89,23 @@ class _Observations:
     error: npt.NDArray[np.float64]
 
     @classmethod
-    def of(cls, model: pycolmap.Reconstruction, scales: Scales) -> _Observations:
-        photos, numbers, points, sizes, errors = [], [], [], [], []
-        for image_id in sorted(model.reg_image_ids()):
-            image = model.images[image_id]
-            seen = [(k, point) for k, point in enumerate(image.points2D) if point.has_point3D()]
-            at = np.array([k for k, _ in seen], np.int64)
-            ids = [point.point3D_id for _, point in seen]
-            places = np.array([model.points3D[each].xyz for each in ids]).reshape(-1, 3)
-            shown = model.cameras[image.camera_id].img_from_cam(image.cam_from_world() * places)
-            offsets = shown - np.array([point.xy for _, point in seen]).reshape(-1, 2)
-            squared = np.nan_to_num(
-                (offsets**2).sum(axis=1)
-            )  # behind the camera, where the solver counts nothing
-            photos.append(np.full(len(seen), image_id))
-            numbers.append(at)
-            points.append(np.array(ids, np.int64))
-            sizes.append(scales[image_id][at])
-            errors.append(2.0 * (np.sqrt(1.0 + squared) - 1.0))
-        return cls(*(np.concatenate(each) for each in (photos, numbers, points, sizes, errors)))
+    def of(cls, model: pycolmap.Reconstruction, scales: Scales) -> _Observations | None:
+        """Those of the registered photos; None where there are none."""
+        columns = []
+        for image_id, observed, off in observations(model):
+            numbers = np.array(model.images[image_id].get_observation_point2D_idxs(), np.int64)
+            points = np.array([point.point3D_id for point in observed], np.int64)
+            squared = np.nan_to_num((off**2).sum(axis=1))
+            loss = 2.0 * (np.sqrt(1.0 + squared) - 1.0)
+            columns.append(
+                (np.full(len(numbers), image_id), numbers, points, scales[image_id][numbers], loss)
+            )
+        if not sum(len(numbers) for _, numbers, *_ in columns):
+            return None
+        return cls(*(np.concatenate(each) for each in zip(*columns, strict=True)))
 
     def rank_in_photo(self) -> npt.NDArray[np.int64]:
-        """How many smaller features the same photo observes."""
+        """How many smaller features the same photo observes [n]; of equal ones the order counts."""
         order = np.lexsort((self.scale, self.photo))
         rank = np.empty(len(order), np.int64)
         rank[order] = np.arange(len(order)) - np.searchsorted(self.photo[order], self.photo[order])

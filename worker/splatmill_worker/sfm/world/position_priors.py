@@ -20,7 +20,8 @@ PHOTOS_PER_ERROR = 3
 (decisions: position-priors)."""
 
 LEAST_PIXELS = 0.05
-"""Error of an observation in pixels, at least, against which that of GPS is weighed."""
+"""Error of an observation in pixels, at least, against which that of GPS is weighed: a smaller one would be a
+perfect fit of generated data."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class PositionPriors:
     to_metres: from the world of the model to metres to the east, to the north and upwards.
     priors: of each photo whose position agrees with the others, in those metres.
     error: standard deviation of a coordinate of one of them, in metres, at least georeference.GPS_ERROR. The covariance
-        of a prior is larger, for the solver takes the standard deviation of an observation for one pixel.
+        of a prior is larger, because the solver takes the error of an observation for one pixel.
     """
 
     to_metres: pycolmap.Sim3d

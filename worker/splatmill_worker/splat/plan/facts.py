@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
@@ -178,11 +178,19 @@ class Facts:
         }
 
 
-def measure(scene: Scene, views: Sequence[TrainingView], held_out: int, speed: Speed | None) -> Facts:
+def measure(
+    scene: Scene,
+    views: Sequence[TrainingView],
+    held_out: int,
+    speed: Speed | None,
+    tell: Callable[[str], None] = lambda part: None,
+) -> Facts:
     """Facts of `scene`, whose training photos are `views` in the same world, of any origin and unit.
 
     held_out: number of held-out photos. speed: of this machine; None where it was not probed.
+    tell: called with what is measured of the photos, before each part that takes seconds where there are many.
     """
+    tell("comparing the light of the photos")
     sizes = np.array([[view.full.camera.width, view.full.camera.height] for view in views])
     width, height = (int(value) for value in np.median(sizes, axis=0))
     seen = Observations.of(scene, views)
@@ -203,7 +211,7 @@ def measure(scene: Scene, views: Sequence[TrainingView], held_out: int, speed: S
         geometry=None
         if seen is None
         else Geometry(seen.view_angle(_own_points(scene)), seen.distance_ratio()),
-        coverage=_coverage(scene, views),
+        coverage=_coverage(scene, views, tell),
         alignment=_alignment(views),
         reprojection=_reprojection(scene, max(width, height)),
         lens_residual=_lens_residual(scene, max(width, height)),
@@ -234,11 +242,13 @@ def _alignment(views: Sequence[TrainingView]) -> float | None:
     return float(np.linalg.norm(np.mean([view.full.camera.viewmat[2, :3] for view in views], axis=0)))
 
 
-def _coverage(scene: Scene, views: Sequence[TrainingView]) -> Coverage | None:
+def _coverage(scene: Scene, views: Sequence[TrainingView], tell: Callable[[str], None]) -> Coverage | None:
     if len(scene.points) < ENOUGH_POINTS or any(view.full.alpha is not None for view in views):
         return None
+    tell("comparing the photos with the points")
     cells = cells_of(scene, views)
     shell, _ = shell_points(cells, scene.points)
+    tell("looking for gaps between the points")
     return Coverage(
         sightings=float(np.median([len(grid.points) for grid in cells])),
         in_view=_in_view(scene, views),

@@ -57,7 +57,7 @@ def shell_points(cells: Sequence[Cells], points: Float) -> tuple[Float, Pixels]:
         weights.append(np.where((extended == nearest).all(axis=1), 1.0, BORDER_WEIGHT))
     position, color, weight = np.concatenate(positions), np.concatenate(colors), np.concatenate(weights)
     patch = PATCH_CELLS * radius * float(np.median([1.0 / grid.camera.fx for grid in cells]))
-    # One number for the three coordinates of a patch, whose order is theirs: sorting rows takes ten times as long.
+    # The three coordinates of a patch as one number, in the same order: sorting rows takes ten times as long.
     most = int(radius / patch) + 2
     place = np.floor(position / patch).astype(np.int64) + most
     _, group = np.unique(np.ravel_multi_index(place.T, (2 * most,) * 3), return_inverse=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -30,11 +30,14 @@ def add_seeds(
     add_far_shell: bool,
     max_gaussians: int,
     backend: ops.Backend | None = None,
+    tell: Callable[[str], None] = lambda part: None,
 ) -> Gaussians:
     """`gaussians`, which were made from the points of `scene`, with more in the gaps between them and on a far shell.
 
     At most `max_gaussians` result. Where there would be more, those added are thinned evenly: those in the gaps first,
     then those on the shell.
+
+    tell: called with what is done, before the part that takes seconds where there are many photos.
     """
     if not (fill_gaps or add_far_shell):
         return gaussians
@@ -43,6 +46,7 @@ def add_seeds(
     if add_far_shell:
         found.append((*far_shell.shell_points(cells, scene.points), far_shell.OPACITY))
     if fill_gaps:
+        tell("filling gaps between the points")
         found.append((*gaps.gap_points(cells), INITIAL_OPACITY))
     parts = [gaussians]
     room = max(0, max_gaussians - gaussians.count)
