@@ -174,8 +174,8 @@ def test_a_bulge_goes_where_large_features_are_wrong_and_photos_are_not_register
     for image in range(1, len(truth) + 1):
         observed = worse.images[image].points2D
         large = np.array([point.has_point3D() and point.point3D_id % 3 == 0 for point in observed])
-        for number in np.flatnonzero(large):
-            observed[int(number)].xy = observed[int(number)].xy + rng.normal(0.0, 3.0, 2)
+        for index in np.flatnonzero(large):
+            observed[int(index)].xy = observed[int(index)].xy + rng.normal(0.0, 3.0, 2)
         scales.append(np.where(large, 9.0, 1.0))
     for number in range(2, len(truth), 13):
         worse.deregister_frame(worse.images[number + 1].frame_id)
