@@ -55,11 +55,13 @@ def model_of(
     count: int = 36,
     focals: tuple[float, ...] = (FOCAL,),
     observed: int = OBSERVED,
+    distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0),
 ) -> pycolmap.Reconstruction:
     """A model of photos along `motion` whose camera starts with `focal`; the `few` first have another such camera.
 
     focals: the true focal lengths, of photos in turn.
     observed: points that a photo observes at most.
+    distortion: k1, k2, p1 and p2 of the true lens.
     """
     rng = np.random.default_rng(0)
     points = rng.uniform(-1, 1, (POINTS, 3))
@@ -75,7 +77,10 @@ def model_of(
     for number in range(count):
         pose = look(*motion(number / (count - 1)))
         local = points @ pose[:, :3].T + pose[:, 3]
-        pixels = focals[number % len(focals)] * local[:, :2] / local[:, 2:] + [WIDTH / 2, HEIGHT / 2]
+        true = focals[number % len(focals)]
+        params = [true, true, WIDTH / 2, HEIGHT / 2, *distortion]
+        lens = pycolmap.Camera(model="OPENCV", width=WIDTH, height=HEIGHT, params=params)
+        pixels = lens.img_from_cam(local, False)
         pixels += rng.normal(0, 0.33, (POINTS, 2))
         seen = np.flatnonzero(((pixels > 0) & (pixels < [WIDTH, HEIGHT])).all(1) & (local[:, 2] > 0))
         keep = rng.permutation(seen)[:observed]

@@ -18,6 +18,9 @@ from splatmill_worker.sfm.mapping import adjust
 from splatmill_worker.sfm.mapping.adjust import adjust_with_lenses
 from tests.support.scenes.motions import FOCAL, Motion, ball, circle, grid, line, model_of
 
+LENS = (-0.2, 0.2, 0.004, -0.003)
+"""k1, k2, p1 and p2 of a lens that SIMPLE_RADIAL does not describe."""
+
 
 @pytest.mark.parametrize(
     ("motion", "tied", "assumed"),
@@ -26,7 +29,7 @@ from tests.support.scenes.motions import FOCAL, Motion, ball, circle, grid, line
 )
 def test_only_determined_parameters_are_estimated(motion: Motion, tied: bool, assumed: bool) -> None:
     start = 1.15 * FOCAL
-    adjusted = adjust_with_lenses(model_of(motion, start), {1: start}, 1, lambda: False)
+    adjusted = adjust_with_lenses(model_of(motion, start, distortion=LENS), {1: start}, 1, lambda: False)
     camera = adjusted.model.cameras[1]
     assert (bool(adjusted.tied), bool(adjusted.assumed)) == (tied, assumed)
     assert camera.model.name == ("SIMPLE_RADIAL" if tied else "OPENCV")
@@ -34,6 +37,23 @@ def test_only_determined_parameters_are_estimated(motion: Motion, tied: bool, as
     assert camera.focal_length_x == pytest.approx(expected, rel=1e-9 if assumed else 5e-3)
     assert camera.focal_length_y / camera.focal_length_x == pytest.approx(1, abs=2e-3)
     assert adjusted.model.compute_mean_reprojection_error() < 0.5
+
+
+def test_a_lens_without_distortion_gets_no_parameters_that_would_explain_noise() -> None:
+    adjusted = adjust_with_lenses(model_of(ball, FOCAL), {1: FOCAL}, 1, lambda: False)
+    assert adjusted.model.cameras[1].model.name == "SIMPLE_RADIAL"
+    assert not adjusted.tied
+    assert not adjusted.assumed
+    assert abs(adjusted.model.cameras[1].params[3]) < 5e-3
+
+
+def test_more_parameters_pay_by_the_logarithm_of_the_number_of_residuals() -> None:
+    # 2000 residuals, four parameters: 2000 log(cost / less) > 4 log 2000 = 30.4, which is a factor of 1.01532.
+    assert adjust.explains_more(101.54, 100.0, 1000, 4)
+    assert not adjust.explains_more(101.52, 100.0, 1000, 4)
+    assert not adjust.explains_more(101.54, 100.0, 1000, 5)
+    assert not adjust.explains_more(100.0, 100.0, 1000, 0)
+    assert not adjust.explains_more(0.0, 0.0, 0, 4)
 
 
 def test_an_initial_focal_length_is_restored_where_views_are_parallel() -> None:
@@ -44,7 +64,7 @@ def test_an_initial_focal_length_is_restored_where_views_are_parallel() -> None:
 
 
 def test_a_camera_of_few_photos_keeps_the_simple_lens_beside_one_of_many() -> None:
-    model = model_of(ball, FOCAL, few=4)
+    model = model_of(ball, FOCAL, few=4, distortion=LENS)
     initial = dict.fromkeys((1, 2), FOCAL)
     adjusted = adjust_with_lenses(model, initial, 1, lambda: False)
     lenses = {camera: lens.model.name for camera, lens in adjusted.model.cameras.items()}
@@ -77,7 +97,7 @@ def test_a_cancelled_adjustment_ends_between_iterations(monkeypatch: pytest.Monk
 
 
 def test_photos_that_are_not_registered_are_left_out() -> None:
-    model = model_of(ball, FOCAL)
+    model = model_of(ball, FOCAL, distortion=LENS)
     model.deregister_frame(model.images[7].frame_id)
     adjusted = adjust_with_lenses(model, {1: FOCAL}, 1, lambda: False)
     assert adjusted.model.num_reg_images() == adjusted.model.num_images() == 35
@@ -113,7 +133,7 @@ def test_a_part_of_many_photos_determines_no_more_than_all(
 
 
 def test_a_part_that_determines_a_lens_is_enough(monkeypatch: pytest.MonkeyPatch) -> None:
-    model = model_of(ball, FOCAL)
+    model = model_of(ball, FOCAL, distortion=LENS)
     monkeypatch.setattr(adjust, "PART", 18)
     estimated: list[int] = []
     estimate = adjust.Estimate.of

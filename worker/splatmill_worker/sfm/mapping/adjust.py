@@ -19,6 +19,10 @@ from splatmill_worker.sfm.options import FISHEYE
 OPENCV_MIN_PHOTOS = 8
 """Registered photos of a camera from which its four OPENCV distortion coefficients are estimated."""
 
+OPENCV_PARAMETERS = 4
+"""Parameters that an OPENCV camera has more than a SIMPLE_RADIAL one: the ratio of its focal lengths, k2, p1 and p2
+(decisions: OPENCV_PARAMETERS)."""
+
 OPENCV_MIN_OBSERVATIONS = 2000
 """Observations of points by a camera, of those that take part, from which its four OPENCV distortion coefficients are
 estimated."""
@@ -78,9 +82,10 @@ def adjust_with_lenses(
     """Adjust all poses and points, and of each SIMPLE_RADIAL camera the parameters that its photos determine.
 
     Parameters are judged by their standard deviations in the adjustment. A camera gets OPENCV distortion (k1, k2, p1,
-    p2) and separate fx and fy where the ratio fx / fy is determined: motion around one axis leaves a stretch of the
-    scene along that axis nearly free. Where not even the single focal length of SIMPLE_RADIAL is determined, as by
-    parallel views of a plane or along a straight line, the initial one is kept.
+    p2) and separate fx and fy where the ratio fx / fy is determined, since motion around one axis leaves a stretch of
+    the scene along that axis nearly free, and where the observations ask for them: parameters that explain only noise
+    bend a wide scene (decisions: OPENCV_PARAMETERS). Where not even the single focal length of SIMPLE_RADIAL is
+    determined, as by parallel views of a plane or along a straight line, the initial one is kept.
 
     model: is not changed.
     initial: focal length that a camera had before any photo was matched, in pixels, by its id.
@@ -93,20 +98,23 @@ def adjust_with_lenses(
     model = registered(model)  # the covariance needs the pose of every photo
     rich = _well_observed(model, "SIMPLE_RADIAL")
     tied: set[int] = set()
+    simple = adjust(model)
     while rich:
         trial = copy.deepcopy(model)
         _use_opencv(trial, rich)
-        adjust(trial)
+        cost = adjust(trial)
         deviations = Deviations(trial)
         loose = {camera for camera in rich if not deviations.stretch_is_determined(camera)}
         del deviations
         if not loose:
-            if implausible_intrinsics(trial) is None:
+            pays = explains_more(
+                simple, cost, trial.compute_num_observations(), OPENCV_PARAMETERS * len(rich)
+            )
+            if pays and implausible_intrinsics(trial) is None:
                 return Adjusted(trial, frozenset(tied))
             break
         tied |= loose
         rich -= loose
-    adjust(model)
     deviations = Deviations(model)
     assumed = {camera for camera in initial if not deviations.focal_is_determined(camera)}
     del deviations
@@ -117,6 +125,20 @@ def adjust_with_lenses(
             model.cameras[camera].params = params.tolist()
         adjust(model, fixed_focal=True)
     return Adjusted(model, frozenset(tied), frozenset(assumed))
+
+
+def explains_more(cost: float, less: float, observations: int, parameters: int) -> bool:
+    """Whether a model with more parameters explains the observations better than by fitting their noise.
+
+    By the criterion of Schwarz, "Estimating the dimension of a model" (1978), for residuals of unknown variance: two of
+    each observation.
+
+    cost, less: of the adjustments without and with them. parameters: how many there are more.
+    """
+    residuals = 2 * observations
+    if not 0.0 < less < cost:
+        return False
+    return residuals * math.log(cost / less) > parameters * math.log(residuals)
 
 
 def iterations_at_once(model: pycolmap.Reconstruction, most: int) -> int:
@@ -294,8 +316,10 @@ def bundle_adjust(
     priors: Sequence[pycolmap.PosePrior] = (),
     cancelled: Callable[[], bool],
     on_iterations: Callable[[int], None] = lambda done: None,
-) -> None:
+) -> float:
     """Adjust all poses, points and lenses (unless fixed) to convergence, with a robust loss, in place.
+
+    Returns the cost: half of the sum of the losses.
 
     fixed_cameras: keep poses, focal lengths and distortion.
     fixed_intrinsics: keep focal lengths and distortion.
@@ -311,7 +335,7 @@ def bundle_adjust(
     options.refine_focal_length = options.refine_extra_params and not fixed_focal
     at_once = iterations_at_once(model, MAX_ITERATIONS)
     options.ceres.solver_options.max_num_iterations = at_once
-    radius = FIRST_RADIUS
+    radius, cost = FIRST_RADIUS, 0.0
     for done in range(0, MAX_ITERATIONS, at_once):
         on_iterations(done)
         stop_if(cancelled)
@@ -319,16 +343,19 @@ def bundle_adjust(
         problem = _problem_with(priors, model, options) if priors else _problem(model, options)
         solved = problem.solve()
         del problem  # before the next one is built
+        if not isinstance(solved, pycolmap.CeresBundleAdjustmentSummary):  # there is nothing to adjust
+            break
+        steps = solved.ceres_summary
+        cost = steps.final_cost
         if solved.termination_type != pycolmap.BundleAdjustmentTerminationType.NO_CONVERGENCE:
             break
-        assert isinstance(solved, pycolmap.CeresBundleAdjustmentSummary)
-        steps = solved.ceres_summary
         good = steps.num_successful_steps - 1  # the first one is where it begins
         if good and steps.initial_cost - steps.final_cost <= FUNCTION_TOLERANCE * steps.initial_cost:
             break
         radius = radius_after(radius, good, steps.num_unsuccessful_steps)
     update_errors(model)
     stop_if(cancelled)
+    return cost
 
 
 def _options(threads: int) -> pycolmap.BundleAdjustmentOptions:
