@@ -6,14 +6,21 @@ Does not prove that a tile is trained: tests/service/test_tiles.py does.
 from __future__ import annotations
 
 import logging
+import os
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 import redis
 
+from splatmill.backplane.jobs.row import now
 from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import TrainOptions
 from splatmill_worker.service.job_folder import TileFolder
+from splatmill_worker.service.process_exit import WITHDRAWN_STATUS
+from splatmill_worker.service.units import run_tile as run_tile_module
+from splatmill_worker.service.units import stored_units
 from splatmill_worker.service.units.run_tile import TileEntry, run_tile
 from splatmill_worker.service.units.stored_units import StoredUnits
 from splatmill_worker.tiles.folder import PlanFolder, digest_of
@@ -59,8 +66,64 @@ def test_a_failure_with_a_name_leaves_the_tile_to_the_attempt(
     assert "stay free" in caplog.text
 
 
-def test_a_tile_of_a_job_that_is_gone_is_dropped(entry: TileEntry, caplog: pytest.LogCaptureFixture) -> None:
-    write_row(entry.connection, JOB, generation=2)
-    with caplog.at_level(logging.INFO, "splatmill.attempt"):
+def statuses_of(entry: TileEntry, monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The status with which the process of a tile exits early; empty where it ends by itself."""
+    statuses: list[int] = []
+
+    def leave(status: int) -> None:
+        statuses.append(status)
+        raise SystemExit
+
+    monkeypatch.setattr(os, "_exit", leave)
+    with suppress(SystemExit):
         run_tile(entry)
-    assert "no longer" in caplog.text
+    return statuses
+
+
+def restarted(entry: TileEntry) -> None:
+    write_row(entry.connection, JOB, generation=2)
+
+
+def cancelled(entry: TileEntry) -> None:
+    write_row(entry.connection, JOB, cancel_requested_at=now())
+
+
+def deleted(entry: TileEntry) -> None:
+    entry.connection.flushdb()
+
+
+ENDS = pytest.mark.parametrize("end", [restarted, cancelled, deleted])
+
+
+@ENDS
+def test_a_tile_of_a_job_that_is_over_is_withdrawn_before_it_begins(
+    entry: TileEntry, monkeypatch: pytest.MonkeyPatch, end: Callable[[TileEntry], None]
+) -> None:
+    end(entry)
+    assert statuses_of(entry, monkeypatch) == [WITHDRAWN_STATUS]
+
+
+@ENDS
+@pytest.mark.parametrize("lost", [True, False], ids=["plan", "coarse model"])
+def test_a_tile_that_lacks_files_of_a_job_that_is_over_is_withdrawn(
+    entry: TileEntry,
+    local: Storage,
+    monkeypatch: pytest.MonkeyPatch,
+    end: Callable[[TileEntry], None],
+    lost: bool,
+) -> None:
+    class EndsMeanwhile(StoredUnits):
+        def plan(self) -> ScenePlan | None:
+            end(entry)
+            return None if lost else super().plan()
+
+    monkeypatch.setattr(run_tile_module, "StoredUnits", EndsMeanwhile)
+    assert statuses_of(entry, monkeypatch) == [WITHDRAWN_STATUS]
+
+
+def test_a_plan_of_another_version_leaves_the_tile_to_the_attempt(
+    entry: TileEntry, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(stored_units, "__version__", "0.0.0")
+    assert statuses_of(entry, monkeypatch) == []
+    assert "made by another version" in caplog.text

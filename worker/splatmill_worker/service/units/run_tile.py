@@ -58,10 +58,7 @@ def run_tile(entry: TileEntry) -> None:
     HANDED_BACK_STATUS when the worker stops. Raises errors of storage, Redis and the system, which the queue is to try
     again.
     """
-    row = patiently(lambda: _row_to_help(entry))
-    if row is None:
-        log.info("the job %s needs its tile %d no longer", entry.job_id, entry.tile)
-        return
+    row = _row_or_exit(entry)
     watch = _JobWatch(entry)
     disk = DiskWatch()
 
@@ -73,6 +70,7 @@ def run_tile(entry: TileEntry) -> None:
     except Exception as caught:
         if hand_back.requested():
             os._exit(HANDED_BACK_STATUS)
+        _row_or_exit(entry)
         error = disk.error or caught
         if not isinstance(error, WorkerError):
             raise
@@ -87,6 +85,7 @@ def _train(entry: TileEntry, row: JobRow, stopped: Callable[[], bool]) -> None:
     units = StoredUnits(storage, entry.job_id)
     plan, name = units.plan(), tile_name(entry.tile)
     if plan is None:
+        _row_or_exit(entry)
         log.warning("the plan of the job %s is gone, or was made by another version", entry.job_id)
         return
     folder = TileFolder(storage, entry.job_id, row.capture)
@@ -111,6 +110,18 @@ def _train(entry: TileEntry, row: JobRow, stopped: Callable[[], bool]) -> None:
         units.put(run.path)
     finally:
         folder.close()
+
+
+def _row_or_exit(entry: TileEntry) -> JobRow:
+    """The row of the job. Exits the process with WITHDRAWN_STATUS where the job needs the tile no longer.
+
+    Asked also after a failure: what a job has in storage is deleted once it has ended.
+    """
+    row = patiently(lambda: _row_to_help(entry))
+    if row is None:
+        log.info("the job %s needs its tile %d no longer", entry.job_id, entry.tile)
+        os._exit(WITHDRAWN_STATUS)
+    return row
 
 
 def _row_to_help(entry: TileEntry) -> JobRow | None:
