@@ -46,13 +46,13 @@ def make_old(claim: Path) -> None:
 
 def test_units_end_in_their_order_and_leave_only_outputs(shared: PlanFolder) -> None:
     assert shared.ended() == {}
-    for name in ("cameras", "coarse", "tile-1", "tile-2", "scene"):
+    for name in ("cameras", "coarse", "tile-1", "tile-2", "seam-1", "seam-2", "scene"):
         assert name in shared.plan.ready(shared.states())
         do(shared, name)
     assert set(shared.states().values()) == {"done"}
     left = {path.name.rpartition("-")[0] for path in (shared.root / "units").iterdir()}
-    assert left == {"cameras", "coarse", "tile-1", "tile-2", "scene"}
-    assert len(list((shared.root / "units").iterdir())) == 5
+    assert left == {"cameras", "coarse", "tile-1", "tile-2", "seam-1", "seam-2", "scene"}
+    assert len(list((shared.root / "units").iterdir())) == 7
 
 
 def test_a_unit_that_another_process_runs_is_claimed(shared: PlanFolder) -> None:
@@ -164,13 +164,18 @@ def test_a_failure_is_kept_until_it_is_forgotten(shared: PlanFolder) -> None:
         run.fail("Training diverged.", "Try another seed.")
     ended = shared.ended()["tile-1"]
     assert (ended.state, ended.failure, ended.advice) == ("failed", "Training diverged.", "Try another seed.")
+    assert shared.plan.ready(shared.states()) == ["seam-1", "seam-2"]
+    do(shared, "seam-1")
+    do(shared, "seam-2")
     assert shared.plan.ready(shared.states()) == ["scene"]
     do(shared, "scene", "partial")
     partial = shared.ended()["scene"].path
     shared.forget_failures("tile-1")
     assert shared.plan.ready(shared.states()) == ["tile-1"]
     do(shared, "tile-1")
-    assert shared.plan.ready(shared.states()) == ["scene"]
+    assert shared.plan.ready(shared.states()) == ["seam-1", "seam-2"]
+    do(shared, "seam-1")
+    do(shared, "seam-2")
     do(shared, "scene", "whole")
     whole = shared.ended()["scene"].path
     assert whole is not None

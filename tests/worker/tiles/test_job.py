@@ -63,8 +63,8 @@ class Play(job.Nobody):
 
     def offer(self, tiles: Sequence[str]) -> None:
         if not self.offered:
-            self.offered = list(tiles)
             self._at_offer(self._folder)
+        self.offered += [name for name in tiles if name not in self.offered]
 
     def take_back(self, tile: str) -> bool:
         return tile not in self.has
@@ -104,8 +104,8 @@ def test_units_are_done_in_order_and_stored_and_those_of_others_are_waited_for(t
     outcome, events = run(tmp_path, others)
     assert outcome.ended == "succeeded"
     assert (others.offered, others.stores, others.ended) == (
-        ["tile-1", "tile-2"],
-        ["cameras", "coarse", "tile-1"],
+        ["tile-1", "tile-2", "seam-1", "seam-2"],
+        ["cameras", "coarse", "tile-1", "seam-1", "seam-2"],
         1,
     )
     assert [event.state for event in events if isinstance(event, StateEvent)] == [
@@ -115,6 +115,7 @@ def test_units_are_done_in_order_and_stored_and_those_of_others_are_waited_for(t
     ]
     notes = {event.note for event in events if isinstance(event, ProgressEvent)}
     assert "tile 1 of 2" in notes
+    assert "seam 2 of 2" in notes
     assert "tile 2 of 2" not in notes
     report = json.loads((outcome.out / "report.json").read_text())
     assert report["curve"][-1]["step"] == 150
@@ -133,6 +134,23 @@ def test_a_failed_tile_is_said_and_the_scene_is_made_without_it(tmp_path: Path) 
     assert any("Tile 1 of 2 failed" in message and "Nothing shows it." in message for message in said)
     report = json.loads((outcome.out / "report.json").read_text())
     assert any("Tile 1 of 2 failed" in warning for warning in report["warnings"])
+    assert report["curve"][-1]["step"] == 50 + 50
+
+
+def test_a_tile_without_its_last_steps_is_said_and_used_as_it_is(tmp_path: Path) -> None:
+    def fail(folder: PlanFolder) -> None:
+        for name in ("tile-1", "tile-2"):
+            with folder.claimed(name) as run:
+                run_unit(Context(folder, run, lambda event: None, lambda: False))
+        with folder.claimed("seam-1") as run:
+            run.fail("It diverged.", "")
+
+    outcome, _ = run(tmp_path, Play(fail))
+    report = json.loads((outcome.out / "report.json").read_text())
+    (warning,) = (each for each in report["warnings"] if "Tile 1 of 2" in each)
+    assert "lacks its last steps" in warning
+    assert "It diverged." in warning
+    assert report["curve"][-1]["step"] == 50 + 40 + 50
 
 
 def test_a_coarse_training_that_was_interrupted_continues(tmp_path: Path) -> None:

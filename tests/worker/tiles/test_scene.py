@@ -22,6 +22,7 @@ from splatmill.schema import Backend, ModelCameras, Report, TrainOptions
 from splatmill_worker import pipeline
 from splatmill_worker.kernels.gpu.device import absence
 from splatmill_worker.splat.formats import registry
+from splatmill_worker.splat.plan.rates import RateSchedule
 from splatmill_worker.tiles import coarse_model, command
 from splatmill_worker.tiles.folder import PlanFolder
 from splatmill_worker.tiles.tile import tile_plan
@@ -70,13 +71,13 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def copied(whole: Path, to: Path, without: tuple[str, ...] = ()) -> Path:
-    """A copy of a plan, without the outputs of some units."""
+    """A copy of a plan, without the outputs of some tiles and of what follows from them."""
     shutil.copytree(whole, to, symlinks=True)
-    for path in (to / "units").iterdir():
-        if path.name.rpartition("-")[0] in without:
-            shutil.rmtree(path)
-    if "scene" in without:
+    if without:
         (to / "scene").unlink()
+        for path in (to / "units").iterdir():
+            if path.name.rpartition("-")[0] in (*without, "seam-1", "seam-2", "scene"):
+                shutil.rmtree(path)
     return to
 
 
@@ -101,8 +102,8 @@ def test_the_scene_is_as_good_as_in_one_piece(whole: Path, tmp_path: Path) -> No
     seams = facts["scene"]["seams"]
     assert 0.0 < seams["share"] < 1.0
     assert seams["seams"] > seams["coarse_seams"] - 0.2
-    assert facts["scene"]["gaussians"] == sum(facts[f"tile-{number}"]["gaussians"] for number in (1, 2))
-    assert min(facts[f"tile-{number}"]["gaussians"] for number in (1, 2)) > 200
+    assert facts["scene"]["gaussians"] == sum(facts[f"seam-{number}"]["gaussians"] for number in (1, 2))
+    assert min(facts[f"seam-{number}"]["gaussians"] for number in (1, 2)) > 200
 
 
 def test_a_tile_goes_on_where_the_coarse_model_stopped(whole: Path) -> None:
@@ -114,9 +115,28 @@ def test_a_tile_goes_on_where_the_coarse_model_stopped(whole: Path) -> None:
     assert plan.schedule.earlier_visits == coarse.steps / len(coarse.viewmats)
     assert plan.schedule.reduced_until == 0
     assert plan.max_gaussians == pytest.approx(3000 * 500 / coarse.gaussians.count, abs=1)
+    last = tile_plan(coarse, free=500, photos=9, last=True)
+    assert (plan.schedule.budget.steps, last.schedule.budget.steps) == (80, 20)
+    assert (last.densify, last.max_gaussians) == (False, 500)
+    assert last.schedule.earlier_visits == (coarse.steps + 80) / len(coarse.viewmats)
+    first_ends, last_begins = (
+        RateSchedule(1.0, each.schedule.annealing).at(progress)
+        for each, progress in ((plan, 1.0), (last, 0.0))
+    )
+    assert first_ends == last_begins
     late = replace(plan.schedule, dropout=0.2, earlier_visits=150.0)
     assert late.left_out(0.0) == pytest.approx(0.1)
     assert late.left_out(50.0) == pytest.approx(0.2)
+
+
+def test_a_tile_sets_no_photo_aside_that_the_coarse_model_was_trained_on(whole: Path) -> None:
+    path = PlanFolder.open(whole).ended()["coarse"].path
+    assert path is not None
+    coarse = coarse_model.read(path)
+    watched = replace(coarse.plan, validation=2, stops_when_flat=True, target_psnr=30.0)
+    plan = tile_plan(replace(coarse, plan=watched, steps=70), free=500, photos=9)
+    assert (plan.validation, plan.stops_when_flat, plan.target_psnr) == (None, False, None)
+    assert plan.schedule.budget.steps == plan.schedule.expected_steps == 56
 
 
 def test_the_scene_has_the_files_of_a_training(whole: Path) -> None:
@@ -137,7 +157,7 @@ def test_the_scene_has_the_files_of_a_training(whole: Path) -> None:
 def test_the_bytes_are_the_same_whoever_does_the_units_and_one_of_them_is_killed(
     whole: Path, tmp_path: Path
 ) -> None:
-    root = copied(whole, tmp_path / "plan", without=("tile-1", "tile-2", "scene"))
+    root = copied(whole, tmp_path / "plan", without=("tile-1", "tile-2"))
     killed = program("splatmill", "unit", str(root), "tile-1")
     claims = root / "units"
     end = time.monotonic() + 100
@@ -150,11 +170,11 @@ def test_the_bytes_are_the_same_whoever_does_the_units_and_one_of_them_is_killed
     texts = [process.communicate(timeout=600)[0] for process in both]
     assert [process.returncode for process in both] == [0, 0], texts
     assert model_of(root) == model_of(whole)
-    assert len(list(claims.iterdir())) == 5, "nothing but outputs is left"
+    assert len(list(claims.iterdir())) == 7, "nothing but outputs is left"
 
 
 def test_a_unit_that_is_stopped_is_free_and_its_partners_are_kept(whole: Path, tmp_path: Path) -> None:
-    root = copied(whole, tmp_path / "plan", without=("tile-2", "scene"))
+    root = copied(whole, tmp_path / "plan", without=("tile-2",))
     process = program("splatmill", "unit", str(root))
     end = time.monotonic() + 100
     while not list((root / "units").glob("tile-2*.claim")) and time.monotonic() < end:
@@ -169,12 +189,12 @@ def test_a_unit_that_is_stopped_is_free_and_its_partners_are_kept(whole: Path, t
 
 
 def test_a_failed_tile_leaves_a_scene_with_the_coarse_model_in_its_place(whole: Path, tmp_path: Path) -> None:
-    root = copied(whole, tmp_path / "plan", without=("tile-1", "scene"))
+    root = copied(whole, tmp_path / "plan", without=("tile-1",))
     folder = PlanFolder.open(root)
     with folder.claimed("tile-1") as run:
         run.fail("Training diverged.", "Try another seed.")
     text = done("splatmill", "unit", str(root))
-    assert text.startswith("scene: begins\n"), text
+    assert text.startswith("seam-1: begins\n"), text
     assert "tile-1     failed    Training diverged. Try another seed." in text
     report = json.loads((root / "scene" / "report.json").read_text())
     (warning,) = (each for each in report["warnings"] if "Tile 1 of 2" in each)
@@ -188,7 +208,9 @@ def test_another_option_repeats_only_what_depends_on_it_and_other_photos_all(
     root = copied(whole, tmp_path / "plan")
     assert "done already: cameras\n" in planned(whole / "photos", root, steps=60)
     assert PlanFolder.open(root).states() == {"cameras": "done"}
-    assert "done already: cameras, coarse, tile-1, tile-2, scene\n" in planned(whole / "photos", root)
+    assert "done already: cameras, coarse, tile-1, tile-2, seam-1, seam-2, scene\n" in planned(
+        whole / "photos", root
+    )
     (root / "scene").unlink()
     (root / "scene").symlink_to("units")  # as another plan may have left it
     done("splatmill", "unit", str(root))
@@ -208,18 +230,20 @@ def test_another_option_repeats_only_what_depends_on_it_and_other_photos_all(
 
 
 def test_units_are_listed(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    root = copied(whole, tmp_path / "plan", without=("tile-1", "scene"))
+    root = copied(whole, tmp_path / "plan", without=("tile-1",))
     with PlanFolder.open(root).claimed("tile-1"):
         assert command.list_units(root, as_json=True) == 0
         rows = {row["unit"]: row for row in json.loads(capsys.readouterr().out)}
     assert {name: row["state"] for name, row in rows.items()} == {
-        "cameras": "done", "coarse": "done", "tile-1": "running", "tile-2": "done", "scene": "waiting",
+        "cameras": "done", "coarse": "done", "tile-1": "running", "tile-2": "done",
+        "seam-1": "waiting", "seam-2": "waiting", "scene": "waiting",
     }  # fmt: skip
     assert rows["tile-1"]["why"] == f"{os.uname().nodename}, process {os.getpid()}"
-    assert rows["scene"]["why"] == "needs tile-1"
+    assert rows["seam-2"]["why"] == "needs tile-1"
+    assert rows["scene"]["why"] == "needs tile-1, seam-1, seam-2"
     assert rows["coarse"]["psnr"] > 15
     assert command.do_unit(root, "scene") == command.REFUSED
-    assert "scene needs tile-1 first" in capsys.readouterr().err
+    assert "scene needs tile-1, seam-1, seam-2 first" in capsys.readouterr().err
     assert command.do_unit(root, "tile-9") == command.REFUSED
     assert "Its units are cameras, coarse, tile-1" in capsys.readouterr().err
 

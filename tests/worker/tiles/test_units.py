@@ -6,6 +6,7 @@ import random
 
 import pytest
 
+from splatmill.backplane.queue.entries import UNITS_PER_TILE
 from splatmill.schema import TrainOptions
 from splatmill_worker.tiles.units import CAMERA_OPTIONS, ScenePlan, State
 
@@ -30,7 +31,8 @@ def test_a_walk_in_any_order_ends_with_the_scene_unless_what_it_needs_failed(see
         assert set(states) == {unit.name for unit in scene.units}
     else:
         assert "scene" not in states
-        assert not any(name.startswith("tile") for name in states)
+        assert not any(name.startswith(("tile", "seam")) for name in states)
+    assert len(scene.part_names) == UNITS_PER_TILE * scene.tiles
 
 
 def test_only_what_depends_on_an_option_has_another_key() -> None:
@@ -52,6 +54,8 @@ def test_a_scene_without_a_failed_tile_is_another_output() -> None:
     whole = plan().key("scene", {"tile-1": "done", "tile-2": "done"})
     assert plan().key("scene", {"tile-1": "done", "tile-2": "failed"}) != whole
     assert plan().key("scene", {"tile-1": "done"}) == whole
+    assert plan().key("scene", {"seam-1": "failed"}) != whole
+    assert plan().key("seam-3", {"tile-1": "failed"}) != plan().key("seam-3", {})
 
 
 def test_options_that_cameras_follow_from_exist_and_a_plan_survives_json() -> None:

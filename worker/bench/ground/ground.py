@@ -164,9 +164,10 @@ def stages(rows: list[Row]) -> str:
     lines = []
     for row in rows:
         parts = dict(row.get("stages", {}))
-        tiles = [parts.pop(name) for name in list(parts) if name.startswith("tile-")]
-        if tiles:
-            parts[f"{len(tiles)} tiles"] = round(sum(tiles), 1)
+        for kind in ("tile", "seam"):
+            times = [parts.pop(name) for name in list(parts) if name.startswith(f"{kind}-")]
+            if times:
+                parts[f"{len(times)} {kind}s"] = round(sum(times), 1)
         text = ", ".join(f"{name} {seconds:.0f}" for name, seconds in parts.items() if seconds >= 0.5)
         memory, silence = (
             f"`{row[name][:70]}`" if row.get(name) else "" for name in ("memory_after", "silence_after")

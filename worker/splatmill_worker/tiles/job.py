@@ -124,7 +124,7 @@ def run(
     folder.save()
     folder.place(capture)
     folder.release()
-    folder.forget_failures(*plan.tile_names)
+    folder.forget_failures(*plan.part_names)
     work.others.begin(folder)
     try:
         while "scene" not in folder.states():
@@ -146,7 +146,7 @@ def _step(work: _Work) -> None:
         raise Cancelled
     folder, others = work.folder, work.others
     ready = folder.plan.ready(folder.states())
-    tiles = [name for name in ready if name in folder.plan.tile_names]
+    tiles = [name for name in ready if name in folder.plan.part_names]
     if tiles:
         others.offer(tiles)
     free = next((name for name in ready if name not in tiles or others.take_back(name)), None)
@@ -179,7 +179,7 @@ def _do(work: _Work, name: str) -> None:
         except WorkerError as error:
             # Memory that a tile lacks here would be lacking again: no other worker is left to train it.
             passes = may_pass(error) and not isinstance(error, TrainingFailed)
-            if name not in folder.plan.tile_names or passes:
+            if name not in folder.plan.part_names or passes:
                 raise
             run.fail(error.message, error.advice or "")
             work.emit(LogEvent(level="warning", message=f"{name} failed: {error}"))
@@ -193,7 +193,7 @@ def _do(work: _Work, name: str) -> None:
     elif name == "coarse":
         shutil.rmtree(work.workdir / CHECKPOINTS, ignore_errors=True)
         work.workdir.joinpath(PLAN_FILE).unlink(missing_ok=True)
-    elif name in folder.plan.tile_names:
+    elif name in folder.plan.part_names:
         facts = facts_of(run.path)
         message = f"{name} is trained: {facts['gaussians']:,} Gaussians, {facts['photos']} photos."
         work.emit(LogEvent(message=message))

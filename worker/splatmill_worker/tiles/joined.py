@@ -41,12 +41,13 @@ class TrainedTile:
     """How the training of a tile ended.
 
     path: folder of its output; None where it failed.
-    facts: that it published.
-    failure: the sentence that it failed with.
+    steps, seconds: of its training, in all units.
+    failure: the sentence that it failed with, from the beginning or before its last steps.
     """
 
     path: Path | None
-    facts: dict[str, Any]
+    steps: int = 0
+    seconds: float = 0.0
     failure: str = ""
 
 
@@ -70,35 +71,40 @@ class Joining:
     @property
     def steps(self) -> int:
         """Training steps of all units."""
-        return int(self.facts["steps"]) + sum(int(tile.facts.get("steps", 0)) for tile in self.tiles)
+        return int(self.facts["steps"]) + sum(tile.steps for tile in self.tiles)
 
     @property
     def seconds(self) -> float:
         """Training seconds of all units, as long as one process takes for them."""
-        return float(self.facts["train_seconds"]) + sum(
-            float(tile.facts.get("train_seconds", 0.0)) for tile in self.tiles
-        )
+        return float(self.facts["train_seconds"]) + sum(tile.seconds for tile in self.tiles)
 
     @property
     def failures(self) -> list[str]:
-        """A sentence for each tile that failed."""
+        """A sentence for each tile that failed, in whole or in its last steps."""
         return [
             f"Tile {number} of {len(self.tiles)} failed, so that its place shows the coarse model: {tile.failure}"
-            for number, tile in enumerate(self.tiles, 1)
             if tile.path is None
+            else f"Tile {number} of {len(self.tiles)} lacks its last steps, so that its seams may show: {tile.failure}"
+            for number, tile in enumerate(self.tiles, 1)
+            if tile.failure
         ]
 
     def gaussians(self) -> Gaussians:
-        """Those of every cell: of its tile, or of the coarse model where the tile failed."""
-        means = self.coarse.gaussians.means.double().numpy()
-        return concatenate(
-            *(
-                self.coarse.gaussians.select(torch.from_numpy(cell.holds(means)))
-                if tile.path is None
-                else read_gaussians(tile.path)
-                for cell, tile in zip(self.coarse.cells, self.tiles, strict=True)
-            )
+        """Those of all cells."""
+        return joined(self.coarse, [tile.path for tile in self.tiles])
+
+
+def joined(coarse: Coarse, tiles: Sequence[Path | None]) -> Gaussians:
+    """The Gaussians of every cell: of the output of its tile, or of the coarse model where there is none."""
+    means = coarse.gaussians.means.double().numpy()
+    return concatenate(
+        *(
+            coarse.gaussians.select(torch.from_numpy(cell.holds(means)))
+            if path is None
+            else read_gaussians(path)
+            for cell, path in zip(coarse.cells, tiles, strict=True)
         )
+    )
 
 
 def write_scene(joining: Joining) -> dict[str, Any]:

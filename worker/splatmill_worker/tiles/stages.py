@@ -1,4 +1,4 @@
-"""What each unit of a plan does: cameras, the coarse model, a tile, and the scene that all of them make."""
+"""What each unit of a plan does: cameras, the coarse model, a tile, its last steps, and the scene that all make."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from splatmill_worker.pipeline.planning import plan_training, planned_photos
 from splatmill_worker.pipeline.stage_times import Stages
 from splatmill_worker.pipeline.training import train_scene
 from splatmill_worker.splat.engine.open import open_engine
+from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.plan.capacity import resolved
 from splatmill_worker.splat.plan.photos import loading_size, statistics_memory
 from splatmill_worker.splat.plan.plan import Kernels, Plan
@@ -29,7 +30,7 @@ from splatmill_worker.tiles import coarse_model, joined
 from splatmill_worker.tiles.cells import divide
 from splatmill_worker.tiles.folder import PlanFolder, Run, facts_of
 from splatmill_worker.tiles.tile import Tile, train_tile
-from splatmill_worker.tiles.units import ScenePlan, tile_name, tile_number
+from splatmill_worker.tiles.units import ScenePlan, seam_name, tile_name, tile_number
 
 STEPS_SHARE = 0.5
 """Share of the steps of a whole run that the coarse model takes, and that each tile takes after it."""
@@ -170,15 +171,22 @@ def _coarse(context: Context, stages: Stages) -> dict[str, Any]:
 
 
 def _tile(context: Context, stages: Stages) -> dict[str, Any]:
-    number = tile_number(context.run.name)
-    job = context.job(context.folder.plan.options)
+    name, plan = context.run.name, context.folder.plan
+    number, last = tile_number(name), name in plan.seam_names
+    job = context.job(plan.options)
     coarse = coarse_model.read(context.output("coarse"))
     context.run.out.mkdir(exist_ok=True)
     if number > len(coarse.cells):
         return {"gaussians": 0, "steps": 0, "photos": 0}  # the coarse model could not be divided further
-    cameras = joined.known_cameras(job, stages)
-    tile = Tile(job, cameras, coarse, number - 1)
-    result = train_tile(tile, stages)
+    cameras, ended = joined.known_cameras(job, stages), context.folder.ended()
+    if last and ended[tile_name(number)].path is None:
+        return {"gaussians": 0, "steps": 0, "photos": 0}  # the scene has the coarse model there
+    tiles = [ended[tile].path for tile in plan.tile_names[: len(coarse.cells)]] if last else []
+
+    def scene() -> Gaussians:
+        return joined.joined(coarse, tiles) if last else coarse.gaussians
+
+    result = train_tile(Tile(job, cameras, coarse, number - 1, scene, last), stages)
     shutil.rmtree(context.run.out)
     context.run.out.mkdir()
     coarse_model.write_gaussians(context.run.out, result.gaussians)
@@ -190,10 +198,17 @@ def _joining(context: Context, stages: Stages) -> joined.Joining:
     coarse = coarse_model.read(context.output("coarse"))
     job = context.job(_coarse_options(context.folder.plan, coarse.most))
     tiles = []
-    for number in range(len(coarse.cells)):
-        tile = ended[tile_name(number + 1)]
-        facts = {} if tile.path is None else facts_of(tile.path)
-        tiles.append(joined.TrainedTile(tile.path, facts, tile.failure))
+    for number in range(1, len(coarse.cells) + 1):
+        tile, seam = ended[tile_name(number)], ended[seam_name(number)]
+        facts = [facts_of(unit.path) for unit in (tile, seam) if unit.path is not None]
+        tiles.append(
+            joined.TrainedTile(
+                None if tile.path is None else seam.path or tile.path,
+                sum(int(each["steps"]) for each in facts),
+                sum(float(each.get("train_seconds", 0.0)) for each in facts),
+                tile.failure or seam.failure,
+            )
+        )
     return joined.Joining(job, stages, coarse, tuple(tiles), facts_of(context.output("coarse")))
 
 

@@ -1,9 +1,13 @@
-"""Trains one tile: the Gaussians in and next to its cell, with the coarse model of the rest as a fixed context."""
+"""Trains one tile: the Gaussians in and next to its cell, with those of the rest as a fixed context.
+
+That is done in two units. The first starts from the coarse model; the second takes the last steps, from what all tiles
+were trained to.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
@@ -26,6 +30,7 @@ from splatmill_worker.scene import View
 from splatmill_worker.sfm.callbacks import stop_if
 from splatmill_worker.splat.engine.open import open_engine
 from splatmill_worker.splat.gaussians import Gaussians
+from splatmill_worker.splat.plan.budget import Budget
 from splatmill_worker.splat.plan.photos import BYTES_PER_PIXEL, fit_in_memory, statistics_memory
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.train.loop import Hooks, train
@@ -37,6 +42,9 @@ from splatmill_worker.tiles.visibility import Part, parts
 MARGIN = 0.05
 """Width of what is trained around a cell and then left to the tiles beside it, over the longest side of the box that
 holds four fifths of the coarse model."""
+
+LAST = 0.2
+"""Share of the steps of a tile that are taken from what all tiles were trained to (decisions: seams)."""
 
 LOADED = 8
 """Photos that are loaded whole at a time; of each, only the part that shows the tile is kept."""
@@ -50,12 +58,16 @@ class Tile:
     cameras: of the photos.
     coarse: the coarse model.
     number: of the cell, from 0.
+    scene: reads the Gaussians of all cells that its training starts from.
+    last: these are the trained tiles, and the last steps are left.
     """
 
     job: Job
     cameras: Cameras
     coarse: Coarse
     number: int
+    scene: Callable[[], Gaussians]
+    last: bool = False
 
 
 @dataclass(frozen=True)
@@ -75,17 +87,17 @@ def train_tile(tile: Tile, stages: Stages) -> TileResult:
     are. Raises TrainingFailed, and Cancelled.
     """
     coarse = tile.coarse
-    cell, whole = coarse.cells[tile.number], coarse.gaussians
+    cell, whole = coarse.cells[tile.number], tile.scene()
     means = whole.means.double().numpy()
     core = torch.from_numpy(cell.holds(means))
-    free = torch.from_numpy(cell.holds(means, _margin(whole)))
+    free = torch.from_numpy(cell.holds(means, _margin(coarse.gaussians)))
     with stages.measured("load"):
-        views = list(_views(tile, core))
+        views = list(_views(tile, whole, core))
         memory.return_freed()
     within = whole.select(core)
     if not views or not within.count:
         return TileResult(within, {"gaussians": within.count, "steps": 0, "photos": len(views)})
-    plan = tile_plan(coarse, int(free.sum()), len(views))
+    plan = tile_plan(coarse, int(free.sum()), len(views), last=tile.last)
     photo_bytes = BYTES_PER_PIXEL * sum(view.full.camera.width * view.full.camera.height for view in views)
     engine = open_engine(
         whole.select(free),
@@ -94,6 +106,7 @@ def train_tile(tile: Tile, stages: Stages) -> TileResult:
         context=whole.select(~free),
         most_kept=statistics_memory(plan.max_memory, photo_bytes),
     )
+    del whole, means, within  # the engine has its own
 
     def progress(progress: TrainingProgress) -> None:
         tile.job.emit(
@@ -139,36 +152,50 @@ def _some(rows: Tensor, limit: int = 100_000) -> Tensor:
     return rows[:: max(1, math.ceil(len(rows) / limit))]
 
 
-def tile_plan(coarse: Coarse, free: int, photos: int) -> Plan:
-    """The plan of a tile of `free` Gaussians that so many photos show: that of the coarse model, from a model on."""
+def tile_plan(coarse: Coarse, free: int, photos: int, *, last: bool = False) -> Plan:
+    """The plan of a tile of `free` Gaussians that so many photos show: that of the coarse model, from a model on.
+
+    last: of its last steps, in which no Gaussians are added.
+
+    All its steps are as many as the coarse training took, and it sets no photo aside: the coarse model has been trained
+    on all of them, so that they could judge no more.
+    """
     plan, schedule = coarse.plan, coarse.plan.schedule
-    most = max(free, math.ceil(coarse.most * free / max(1, coarse.gaussians.count)))
-    aside = None
-    if plan.validation is not None:
-        aside = max(1, round(plan.validation * photos / len(coarse.viewmats))) if photos > 1 else None
+    until = 1.0 - LAST
+    first = max(1, round(until * coarse.steps))
+    steps = max(1, coarse.steps - first) if last else first
+    before = coarse.steps + first if last else coarse.steps
+    most = free if last else max(free, math.ceil(coarse.most * free / max(1, coarse.gaussians.count)))
     return replace(
         plan,
         kernels="cpu" if plan.kernels == "gpu" else plan.kernels,
         max_gaussians=most,
-        densify=plan.densify or most > free,
+        densify=not last and (plan.densify or most > free),
         initial="model",
         far_shell=False,
         gaps=False,
         pose_refinement=False,
-        validation=aside,
-        stops_when_flat=plan.stops_when_flat and aside is not None,
-        target_psnr=plan.target_psnr if aside is not None else None,
+        validation=None,
+        stops_when_flat=False,
+        target_psnr=None,
         lpips=False,
         schedule=replace(
             schedule.seen_by(photos / len(coarse.viewmats)),
+            budget=Budget(steps=steps),
+            expected_steps=steps,
+            longest=None,
             resolution=((0, 1),),
-            earlier_visits=coarse.steps / max(1, len(coarse.viewmats)),
+            densify_until=min(1.0, schedule.densify_until / until),
+            annealing=replace(schedule.annealing, begin=until if last else 0.0, end=1.0 if last else until),
+            earlier_visits=before / max(1, len(coarse.viewmats)),
         ),
     )
 
 
-def _views(tile: Tile, members: Tensor) -> Iterator[TrainingView]:
-    """The parts of the training photos that show the members, bool [N], in files where memory is too small for them."""
+def _views(tile: Tile, whole: Gaussians, members: Tensor) -> Iterator[TrainingView]:
+    """The parts of the training photos that show the members, bool [N], of the scene `whole`, in files where memory is
+    too small for them.
+    """
     coarse, cameras = tile.coarse, tile.cameras
     size = coarse.plan.image_size
     placed = []
@@ -176,7 +203,7 @@ def _views(tile: Tile, members: Tensor) -> Iterator[TrainingView]:
         stop_if(tile.job.cancelled)
         camera = view.camera.scaled_to(*training_size(view.camera.width, view.camera.height, size))
         placed.append(coarse.corrected(view.name, cameras.normalization.camera(camera)))
-    found = parts(coarse.gaussians, members, placed, antialias=coarse.plan.antialias)
+    found = parts(whole, members, placed, antialias=coarse.plan.antialias)
     chosen = [(view, part) for view, part in zip(cameras.training, found, strict=True) if part is not None]
     room = Room.of(tile.job)
     taken = BYTES_PER_PIXEL * sum(part.pixels for _, part in chosen)

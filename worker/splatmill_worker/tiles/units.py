@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from splatmill.schema import TrainOptions
 
-FORMAT = 2
+FORMAT = 3
 """Version of the plan's format and of what its units make: another one makes everything anew."""
 
 CAMERA_OPTIONS = ("sfm_effort", "matcher", "mapper", "max_video_frames", "scale", "seed", "start")
@@ -60,14 +60,25 @@ class ScenePlan:
         return tuple(tile_name(number) for number in range(1, self.tiles + 1))
 
     @property
+    def seam_names(self) -> tuple[str, ...]:
+        """The units that train each tile to its end, with what the others were trained to around it."""
+        return tuple(seam_name(number) for number in range(1, self.tiles + 1))
+
+    @property
+    def part_names(self) -> tuple[str, ...]:
+        """The units that several machines do at a time, in the order of their numbers in the queue, from 1."""
+        return self.tile_names + self.seam_names
+
+    @property
     def units(self) -> tuple[Unit, ...]:
         """All units, each after those that it needs."""
-        tiles = self.tile_names
+        tiles, seams = self.tile_names, self.seam_names
         return (
             Unit("cameras"),
             Unit("coarse", ("cameras",)),
             *(Unit(name, ("cameras", "coarse")) for name in tiles),
-            Unit("scene", ("cameras", "coarse", *tiles), tiles),
+            *(Unit(name, ("cameras", "coarse", *tiles), tiles) for name in seams),
+            Unit("scene", ("cameras", "coarse", *tiles, *seams), tiles + seams),
         )
 
     def unit(self, name: str) -> Unit:
@@ -126,9 +137,14 @@ def tile_name(number: int) -> str:
     return f"tile-{number}"
 
 
+def seam_name(number: int) -> str:
+    """The name of the unit that trains a tile to its end. number: from 1."""
+    return f"seam-{number}"
+
+
 def tile_number(name: str) -> int:
-    """The number of the tile that the unit `name` trains, from 1."""
-    return int(name.removeprefix("tile-"))
+    """The number of the tile that a unit trains, from 1. name: of a tile or a seam."""
+    return int(name.partition("-")[2])
 
 
 def _unknown(name: str) -> Unit:

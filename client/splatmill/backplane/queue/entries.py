@@ -43,6 +43,8 @@ dies, its job is requeued when its lease has expired (see `leases`), after at mo
 KEEP_FINISHED = 24 * 3600
 """Seconds for which RQ keeps its record of a finished job. Splatmill's own stays until the job is deleted."""
 
+UNITS_PER_TILE = 2
+"""Entries that a scene in tiles may have for each of them: its training from the coarse model, and its last steps."""
 
 KEEP_TILES = 60
 """Seconds for which RQ keeps its record of a tile that has ended: what the tile made is in storage by then."""
@@ -73,7 +75,7 @@ def rq_id(job_id: str, generation: int) -> str:
 
 
 def unit_id(job_id: str, generation: int, tile: int) -> str:
-    """Return RQ's id of a tile, from 1, of a generation whose scene is trained in tiles."""
+    """Return RQ's id of a unit, from 1 to UNITS_PER_TILE times the tiles, of a generation that is trained in tiles."""
     return f"{rq_id(job_id, generation)}_{tile}"
 
 

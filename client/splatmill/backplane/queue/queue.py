@@ -22,6 +22,7 @@ from splatmill.backplane.queue.entries import (
     KEEP_TILES,
     MAX_RETRIES,
     SERIALIZER,
+    UNITS_PER_TILE,
     QueueEntry,
     open_queue,
     rq_id,
@@ -108,8 +109,8 @@ def take_back_tile(connection: redis.Redis, job_id: str, generation: int, tile: 
 
 
 def withdraw_tiles(connection: redis.Redis, job_id: str, generation: int, tiles: int | None) -> None:
-    """Remove the waiting tiles of a generation from the queue. tiles: their number; None for a scene in one piece."""
-    for tile in range(1, (tiles or 0) + 1):
+    """Remove the waiting tiles of a generation from the queue. tiles: of its scene; None for a scene in one piece."""
+    for tile in range(1, UNITS_PER_TILE * (tiles or 0) + 1):
         lines.withdraw(connection, unit_id(job_id, generation, tile), keep=0)
 
 

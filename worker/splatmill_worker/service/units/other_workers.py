@@ -14,7 +14,6 @@ from splatmill_worker.service.redis_patience import patiently
 from splatmill_worker.service.room import Room
 from splatmill_worker.service.units.stored_units import StoredUnits
 from splatmill_worker.tiles.folder import PlanFolder
-from splatmill_worker.tiles.units import tile_number
 
 
 class OtherWorkers:
@@ -30,10 +29,12 @@ class OtherWorkers:
         self._connection, self._job_id, self._generation = connection, job_id, generation
         self._room = room
         self._units = StoredUnits(storage, job_id)
+        self._numbers: dict[str, int] = {}
         self._offered: set[str] = set()
 
     def begin(self, folder: PlanFolder) -> None:
         """Store the plan and what this machine has done of it, and bring what earlier attempts have done elsewhere."""
+        self._numbers = {name: number for number, name in enumerate(folder.plan.part_names, 1)}
         self._units.put_plan(folder.plan)
         self._units.drop_others(folder)
         self.gather(folder)
@@ -67,4 +68,4 @@ class OtherWorkers:
             patiently(partial(self._on, queue.take_back_tile, tile))
 
     def _on(self, act: Callable[[redis.Redis, str, int, int], bool], name: str) -> bool:
-        return act(self._connection, self._job_id, self._generation, tile_number(name))
+        return act(self._connection, self._job_id, self._generation, self._numbers[name])

@@ -25,7 +25,6 @@ from splatmill_worker.service.redis_patience import patiently
 from splatmill_worker.service.units.stored_units import StoredUnits
 from splatmill_worker.settings import storage_url
 from splatmill_worker.tiles.folder import PlanFolder, digest_of
-from splatmill_worker.tiles.units import tile_name
 
 POLL_SECONDS = 0.5
 """Seconds between two questions whether the job still runs."""
@@ -42,7 +41,7 @@ class TileEntry:
 
     connection: the service's Redis.
     job_id, generation: the job.
-    tile: number of the tile, from 1.
+    tile: number of the unit among those that several machines do at a time (`ScenePlan.part_names`), from 1.
     """
 
     connection: redis.Redis
@@ -83,11 +82,12 @@ def run_tile(entry: TileEntry) -> None:
 def _train(entry: TileEntry, row: JobRow, stopped: Callable[[], bool]) -> None:
     storage = Storage(storage_url())
     units = StoredUnits(storage, entry.job_id)
-    plan, name = units.plan(), tile_name(entry.tile)
+    plan = units.plan()
     if plan is None:
         _row_or_exit(entry)
         log.warning("the plan of the job %s is gone, or was made by another version", entry.job_id)
         return
+    name = plan.part_names[entry.tile - 1]
     folder = TileFolder(storage, entry.job_id, row.capture)
     try:
         folder.run.mkdir(parents=True, exist_ok=True)

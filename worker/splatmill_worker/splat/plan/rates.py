@@ -48,6 +48,7 @@ class Annealing:
     hold: share of the budget for which the other rates stay constant.
     rest_fall: last value of the other rates over the first.
     beta2: Adam's factor on the second moments at each step.
+    begin, end: the part of the fall that a run takes, 0 to 1, where another run takes the rest.
     """
 
     boost: float | None = 1.0
@@ -55,6 +56,8 @@ class Annealing:
     hold: float = 0.6
     rest_fall: float = 0.1
     beta2: float = BETA2
+    begin: float = 0.0
+    end: float = 1.0
 
 
 def boost_of(steps: int) -> float:
@@ -83,11 +86,12 @@ class RateSchedule:
     scale: float = 1.0
 
     def at(self, progress: float) -> Rates:
-        """Rates at `progress`, 0 to 1. Raises ValueError where the boost is None: the training run has to set it."""
+        """Rates at `progress` of a run, 0 to 1. Raises ValueError where the boost is None: the run has to set it."""
         fall = self.annealing
         boost = fall.boost
         if boost is None:
             raise ValueError("annealing.boost is None; set it by boost_of(steps) before asking for rates.")
+        progress = fall.begin + (fall.end - fall.begin) * progress
         factor = self.scale * boost
         position = POSITION_START * self.extent * math.exp(math.log(fall.position_fall) * progress)
         late = min(1.0, max(0.0, (progress - fall.hold) / (1.0 - fall.hold)))
