@@ -17,6 +17,7 @@ from splatmill_worker.kernels import ops
 from splatmill_worker.kernels.cpu import isa
 from splatmill_worker.kernels.cpu.step import Step
 from splatmill_worker.kernels.records import Rates
+from splatmill_worker.splat.motion import motion
 from tests.support.kernels.alone import Change, rounding, spread
 from tests.support.kernels.bounds import SUM_LIMIT, within
 from tests.support.kernels.cases import GROUPS, Case, scene
@@ -24,20 +25,6 @@ from tests.support.kernels.proof import use
 from tests.support.kernels.units import DRAWS, moved_leaf
 
 STILL = Rates(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-
-
-def motion(xi: Tensor) -> Tensor:
-    """exp(xi^) [4,4] of a twist (rho, phi)."""
-    rho, phi = xi[:3], xi[3:]
-    zero = torch.zeros((), dtype=xi.dtype)
-    rows = [
-        torch.stack([zero, -phi[2], phi[1], rho[0]]),
-        torch.stack([phi[2], zero, -phi[0], rho[1]]),
-        torch.stack([-phi[1], phi[0], zero, rho[2]]),
-        torch.stack([zero] * 4),
-    ]
-    moved: Tensor = torch.linalg.matrix_exp(torch.stack(rows))
-    return moved
 
 
 def slopes(case: Case) -> list[Tensor]:

@@ -105,6 +105,24 @@ class Bins(NamedTuple):
     ids: Tensor
 
 
+class StepResult(NamedTuple):
+    """What a training step measured before it moved the Gaussians.
+
+    loss: (1 - w) l1 + w (1 - ssim).
+    l1, ssim: means over the pixels used.
+    visible: Gaussians that reach a 4x4-pixel block of the image; on a GPU, those that are not culled.
+    pairs: (tile, Gaussian) pairs.
+    refused: gradient values that were not finite and were left out of the update.
+    """
+
+    loss: float
+    l1: float
+    ssim: float
+    visible: int
+    pairs: int
+    refused: int
+
+
 @dataclass(frozen=True)
 class Rates:
     """Adam's learning rate of each parameter group, and its factor on the second moments.

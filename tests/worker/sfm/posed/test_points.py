@@ -22,6 +22,7 @@ from splatmill_worker.sfm import posed, stereo
 from splatmill_worker.sfm.matching.overlap import by_overlap
 from splatmill_worker.sfm.options import LEAN
 from splatmill_worker.sfm.posed.judged import points
+from splatmill_worker.sfm.posed.judged.searched import model_of
 from splatmill_worker.sfm.posed.judged.triangulation import Triangulated, triangulate
 from splatmill_worker.splat.plan.decide import decide
 from tests.support.plans.facts import FACTS
@@ -114,14 +115,10 @@ def transforms(truth: Truth, names: list[str]) -> str:
 
 
 def colmap_model(truth: Truth) -> pycolmap.Reconstruction:
-    model = pycolmap.Reconstruction()
-    for number, (name, camera) in enumerate(sorted(truth.items()), 1):
-        params = [camera.fx, camera.fy, camera.cx, camera.cy]
-        model.add_camera_with_trivial_rig(
-            pycolmap.Camera(model="PINHOLE", width=WIDTH, height=HEIGHT, params=params, camera_id=number)
-        )
-        image = pycolmap.Image(name=name, camera_id=number, image_id=number)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(camera.viewmat[:3]))
+    names = sorted(truth)
+    model = model_of([truth[name] for name in names])
+    for number, name in enumerate(names, 1):
+        model.images[number].name = name
     return model
 
 

@@ -21,6 +21,7 @@ from torch import Tensor
 from _studies.functions.tolerances import ALPHA_ERROR, U
 from splatmill_worker.kernels import ops
 from splatmill_worker.kernels.records import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN, Bins, Projected
+from splatmill_worker.splat.motion import motion
 
 from .roundings import TINY, inexact_exponential, rounded_remainders, rounded_up_or_down
 from .scenes import GROUPS, Scene
@@ -45,20 +46,6 @@ class Problem:
     unit: Values  # by rounding the inputs
     designed: Values  # by that and the error of 2^x
     explained: Values  # by both and the rounding of what lies behind a splat
-
-
-def motion(xi: Tensor) -> Tensor:
-    """exp(xi^) [4,4] of a twist (rho, phi)."""
-    rho, phi = xi[:3], xi[3:]
-    zero = torch.zeros((), dtype=xi.dtype)
-    rows = [
-        torch.stack([zero, -phi[2], phi[1], rho[0]]),
-        torch.stack([phi[2], zero, -phi[0], rho[1]]),
-        torch.stack([-phi[1], phi[0], zero, rho[2]]),
-        torch.stack([zero] * 4),
-    ]
-    moved: Tensor = torch.linalg.matrix_exp(torch.stack(rows))
-    return moved
 
 
 def _projected(

@@ -12,8 +12,7 @@ from _rows import Row
 from torch import Tensor
 
 from splatmill_worker.errors import TrainingFailed
-from splatmill_worker.kernels.cpu.step import StepResult
-from splatmill_worker.kernels.records import Rates
+from splatmill_worker.kernels.records import Rates, StepResult
 from splatmill_worker.pipeline.training import EXTENT
 from splatmill_worker.splat.engine.cpu import CpuEngine
 from splatmill_worker.splat.engine.protocol import Engine

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from splatmill_worker.kernels import checks
-from splatmill_worker.kernels.records import PARAMETERS, TILE, Rates, Waves
+from splatmill_worker.kernels.records import PARAMETERS, TILE, Rates, StepResult, Waves
 
 from ..morton import morton_order
 from . import blocks, engine
@@ -27,24 +27,6 @@ class Visibility(NamedTuple):
 
     visible: int
     pairs: int
-
-
-class StepResult(NamedTuple):
-    """What one training step measured before it moved the Gaussians.
-
-    loss: (1 - w) l1 + w (1 - ssim).
-    l1, ssim: means over the pixels used.
-    visible: Gaussians that reach a 4x4-pixel block of the image.
-    pairs: (tile, Gaussian) pairs.
-    refused: gradient values that were not finite and were left out of the update.
-    """
-
-    loss: float
-    l1: float
-    ssim: float
-    visible: int
-    pairs: int
-    refused: int
 
 
 class Step:

@@ -6,14 +6,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import accumulate
-from typing import NamedTuple
 
 import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
-from splatmill_worker.kernels.records import BETA2, GROUPS, MOST_PAIRS, PARAMETERS, Rates
+from splatmill_worker.kernels.records import BETA2, GROUPS, MOST_PAIRS, PARAMETERS, Rates, StepResult
 
 from . import adam, device
 from .bin import Lists, Room, lists
@@ -49,26 +48,6 @@ FIRST_PAIRS = 3
 
 SCORES_BLOCK = 256
 """Gaussians per program of `scores_kernel`."""
-
-
-class StepResult(NamedTuple):
-    """What the latest step measured of which the host has heard, up to `readback.AHEAD` steps ago.
-
-    Waiting for the step just enqueued would leave the GPU idle.
-
-    loss: (1 - w) l1 + w (1 - ssim).
-    l1, ssim: means over the pixels used.
-    visible: Gaussians that are not culled.
-    pairs: (tile, Gaussian) pairs.
-    refused: gradient values that were not finite and were left out of the update.
-    """
-
-    loss: float
-    l1: float
-    ssim: float
-    visible: int
-    pairs: int
-    refused: int
 
 
 @triton.jit
@@ -344,8 +323,8 @@ class Step:
         """One step on one photo, enqueued as a whole: render, L1 + D-SSIM, gradients, scores, Adam.
 
         photo uint8 [H,W,3]; alpha uint8 [H,W] of a transparent one, which is laid over the background; mask [H,W],
-        nonzero where a pixel is used; step counts from 1. The numbers returned are those of an earlier step; see
-        `StepResult`.
+        nonzero where a pixel is used; step counts from 1. The numbers returned are those of up to `readback.AHEAD`
+        steps ago: waiting for the step just enqueued would leave the GPU idle.
         """
         height, width = photo.shape[:2]
         with self._sparing():
@@ -363,7 +342,7 @@ class Step:
             refused = torch.zeros(1, dtype=torch.int32, device=self.device)
             self._move(seen, degree, rates, step, refused)
         self._listen(view.key, losses, view.lists.used, refused)
-        return StepResult(*self._readback.latest[1:])
+        return self._readback.latest
 
     def _background(self, background: Tensor | None) -> Tensor | None:
         return None if background is None else to_device(background.float(), self.device)
@@ -478,15 +457,14 @@ class Step:
     def _listen(self, key: ViewKey, losses: Tensor, used: Tensor, refused: Tensor) -> None:
         """Send a step's numbers to the host, and set the room of the views whose numbers have arrived."""
         values = torch.cat([losses.double(), used, refused])
-        for numbers in self._readback.post((self._generation, key), values):
+        for (generation, shown), numbers in self._readback.post((self._generation, key), values):
             self.refused += numbers.refused
-            generation, key = numbers.key
             if generation != self._generation:
                 continue
-            room = self._rooms[key]
+            room = self._rooms[shown]
             if numbers.visible > room.visible or numbers.pairs > room.pairs:
                 self.overflowed += 1
-            self._rooms[key] = _room(numbers.visible, numbers.pairs)
+            self._rooms[shown] = _room(numbers.visible, numbers.pairs)
 
     def _rows(self, planes: Tensor) -> dict[str, Tensor]:
         """Copies [N, ...] of the groups among planes [59, N]."""

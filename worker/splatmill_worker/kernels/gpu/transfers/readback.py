@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections import deque
-from typing import NamedTuple
 
 from torch import Tensor
+
+from splatmill_worker.kernels.records import StepResult
 
 from .transfer import ToHost
 
@@ -13,33 +14,19 @@ AHEAD = 8
 """Steps that the host may be ahead of the device. More would only make the numbers it reads older."""
 
 
-class Numbers(NamedTuple):
-    """What one step measured.
-
-    key: the generation of the parameters (see `Step.replace`), and the key of the view.
-    loss, l1, ssim: of the photo.
-    visible, pairs: Gaussians and (tile, Gaussian) pairs of the view.
-    refused: gradient values that were not finite.
-    """
-
-    key: tuple[int, tuple[int, int, int]]
-    loss: float
-    l1: float
-    ssim: float
-    visible: int
-    pairs: int
-    refused: int
-
-
 class Readback:
     """A queue of copies that are on their way from the device."""
 
     def __init__(self) -> None:
         self._pending: deque[tuple[tuple[int, tuple[int, int, int]], ToHost]] = deque()
-        self._latest: Numbers | None = None
+        self._latest: StepResult | None = None
 
-    def post(self, key: tuple[int, tuple[int, int, int]], values: Tensor) -> list[Numbers]:
-        """Start the copy of values [6] float64, the fields of `Numbers` after the key; returns what has arrived since.
+    def post(
+        self, key: tuple[int, tuple[int, int, int]], values: Tensor
+    ) -> list[tuple[tuple[int, tuple[int, int, int]], StepResult]]:
+        """Start the copy of values [6] float64, the fields of a `StepResult`; returns what has arrived since, by key.
+
+        key: the generation of the parameters (see `Step.replace`), and the key of the view.
 
         Waits only when nothing has ever arrived, or when the host is `AHEAD` steps in front.
         """
@@ -50,13 +37,13 @@ class Readback:
             if not numbers.arrived and self._latest is not None and len(self._pending) <= AHEAD:
                 break
             loss, l1, ssim, visible, pairs, refused = numbers.wait()
-            self._latest = Numbers(name, loss, l1, ssim, int(visible), int(pairs), int(refused))
-            found.append(self._latest)
+            self._latest = StepResult(loss, l1, ssim, int(visible), int(pairs), int(refused))
+            found.append((name, self._latest))
             self._pending.popleft()
         return found
 
     @property
-    def latest(self) -> Numbers:
+    def latest(self) -> StepResult:
         """The numbers of the most recent step that has arrived."""
         if self._latest is None:
             raise RuntimeError("No step has been posted yet.")

@@ -66,6 +66,16 @@ class Evidence:
         return float(self.by_chance.sum() / max(1, self.shown.sum()))
 
 
+def counted_pixels(photo: Photo, row: npt.NDArray[np.int64], column: npt.NDArray[np.int64]) -> Flags:
+    """Which pixels [n] of a photo count: neither masked nor more than half transparent."""
+    counted = np.ones(len(row), bool)
+    if photo.mask is not None:
+        counted &= photo.mask[row, column]
+    if photo.alpha is not None:
+        counted &= photo.alpha[row, column] >= 128
+    return counted
+
+
 def evidence_of(
     points: Float, colors: Colors, views: Sequence[View], cancelled: Callable[[], bool] = lambda: False
 ) -> Evidence:
@@ -87,11 +97,7 @@ def evidence_of(
             alpha = torch.from_numpy(photo.alpha)[None].float()
             clear = (torch.nn.functional.max_pool2d(alpha, 3, 1, 1)[0] < 1.0).numpy()
             through[rows] += clear[row, column]
-        counted = np.ones(len(rows), bool)
-        if photo.mask is not None:
-            counted &= photo.mask[row, column]
-        if photo.alpha is not None:
-            counted &= photo.alpha[row, column] >= 128
+        counted = counted_pixels(photo, row, column)
         rows, row, column = rows[counted], row[counted], column[counted]
         planes = torch.from_numpy(photo.rgb).permute(2, 0, 1).float()
         high = torch.nn.functional.max_pool2d(planes, 3, 1, 1).numpy()[:, row, column].T + TOLERANCE

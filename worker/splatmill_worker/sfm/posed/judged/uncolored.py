@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatmill_worker.scene import Float, View
-from splatmill_worker.sfm.posed.judged.evidence import Colors, photos
+from splatmill_worker.sfm.posed.judged.evidence import Colors, counted_pixels, photos
 from splatmill_worker.sfm.posed.judged.visible import visible
 
 MOST_PHOTOS = 48
@@ -68,11 +68,7 @@ def seen_in(points: Float, views: Sequence[View], cancelled: Callable[[], bool] 
         place = photo.camera.project(points)
         rows = visible(photo.camera, place)
         row, column = place.rows[rows].astype(np.int64), place.columns[rows].astype(np.int64)
-        counted = np.ones(len(rows), bool)
-        if photo.mask is not None:
-            counted &= photo.mask[row, column]
-        if photo.alpha is not None:
-            counted &= photo.alpha[row, column] >= 128
+        counted = counted_pixels(photo, row, column)
         rows, row, column = rows[counted], row[counted], column[counted]
         there[index, rows] = True
         own[index, rows] = photo.rgb[row, column]
