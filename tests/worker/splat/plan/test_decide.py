@@ -276,6 +276,15 @@ def test_a_budget_of_many_visits_is_watched_for_over_fitting() -> None:
     assert planned(time_budget=600).stops_when_flat
 
 
+def test_photos_that_a_given_model_may_have_been_trained_on_judge_nothing() -> None:
+    model = changed(start=GivenModel(700, 3, 27.0, 12.0, 11.0))
+    for plan in (planned(model), planned(model, steps=9000)):
+        assert (plan.validation, plan.stops_when_flat, plan.schedule.longest) == (None, False, None)
+        assert "may have been trained on any of the 43 photos" in plan.left_out["validation"]
+    target = planned(model, target_psnr=30)
+    assert (target.validation, target.stops_when_flat, target.schedule.longest) == (3, False, None)
+
+
 def test_few_photos_are_all_trained_on_unless_a_target_needs_one() -> None:
     for few in (planned(changed(views=11)), planned(changed(views=11), steps=6000)):
         assert few.validation is None

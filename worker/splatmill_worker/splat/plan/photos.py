@@ -213,8 +213,11 @@ def least_gain(facts: Facts, options: TrainOptions) -> float | None:
     """Gain of a doubling of the steps on the validation photos, dB, below which training ends.
 
     That of the preset where no budget is given; 0 where training ends only once it over-fits; None where a target alone
-    ends it before its budget.
+    ends it before its budget, and where a model is given: it may have been trained on any of the photos, which would
+    then show it best before the first step.
     """
+    if facts.start is not None:
+        return None
     if options.doubles(facts.views):
         return PRESET_GAIN[options.ending]
     return 0.0 if options.target_psnr is None else None
@@ -237,6 +240,12 @@ def decide_validation(facts: Facts, options: TrainOptions, steps: int) -> Decisi
             )
         count = max(1, count)
         what = f"the training ends when their mean PSNR reaches {options.target_psnr:g} dB"
+    elif facts.start is not None:
+        return Decision(
+            None,
+            f"The given model may have been trained on any of the {facts.views} photos, so that none of them could "
+            "judge by being set aside, and the training does not end before its budget.",
+        )
     elif gain:
         what = (
             "the training ends when the last doubling of the steps has raised their mean PSNR by less than "
