@@ -62,3 +62,10 @@ def test_a_margin_widens_a_cell_on_each_side_and_corners_survive_json() -> None:
     again = Cell.from_dict(cell.as_dict())
     assert again.low.tolist() == cell.low.tolist()
     assert again.high.tolist() == cell.high.tolist()
+
+
+def test_cells_touch_that_share_a_side() -> None:
+    points = np.random.default_rng(0).uniform(size=(4000, 3)) * [8.0, 1.0, 1.0]
+    cells = sorted(divide(points, np.ones(len(points)), 4), key=lambda cell: cell.low[0])
+    touching = {(a, b) for a in range(4) for b in range(4) if cells[a].touches(cells[b])}
+    assert touching == {(a, b) for a in range(4) for b in range(4) if abs(a - b) <= 1}

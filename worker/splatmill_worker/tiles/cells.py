@@ -31,6 +31,10 @@ class Cell:
         held: npt.NDArray[np.bool_] = np.logical_and.reduce(inside, axis=1)
         return held
 
+    def touches(self, other: Cell) -> bool:
+        """Whether the cells share a point of their sides."""
+        return bool(((self.low <= other.high) & (other.low <= self.high)).all())
+
     def as_dict(self) -> dict[str, list[float | None]]:
         """The corners as lists for JSON, with None for an infinite coordinate."""
         return {

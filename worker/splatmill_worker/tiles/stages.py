@@ -181,10 +181,16 @@ def _tile(context: Context, stages: Stages) -> dict[str, Any]:
     cameras, ended = joined.known_cameras(job, stages), context.folder.ended()
     if last and ended[tile_name(number)].path is None:
         return {"gaussians": 0, "steps": 0, "photos": 0}  # the scene has the coarse model there
-    tiles = [ended[tile].path for tile in plan.tile_names[: len(coarse.cells)]] if last else []
+    own = coarse.cells[number - 1]
 
     def scene() -> Gaussians:
-        return joined.joined(coarse, tiles) if last else coarse.gaussians
+        if not last:
+            return coarse.gaussians
+        # Cells that do not touch this one stay coarse, so that the memory of many tiles is not needed.
+        trained = zip(coarse.cells, plan.tile_names, strict=False)
+        return joined.joined(
+            coarse, [ended[tile].path if cell.touches(own) else None for cell, tile in trained]
+        )
 
     result = train_tile(Tile(job, cameras, coarse, number - 1, scene, last), stages)
     shutil.rmtree(context.run.out)

@@ -1,7 +1,7 @@
 """Trains one tile: the Gaussians in and next to its cell, with those of the rest as a fixed context.
 
-That is done in two units. The first starts from the coarse model; the second takes the last steps, from what all tiles
-were trained to.
+That is done in two units. The first starts from the coarse model; the second takes the last steps, beside the tiles
+that were trained around it.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ MARGIN = 0.05
 holds four fifths of the coarse model."""
 
 LAST = 0.2
-"""Share of the steps of a tile that are taken from what all tiles were trained to (decisions: seams)."""
+"""Share of the steps of a tile that are taken beside the trained tiles around it (decisions: seams)."""
 
 LOADED = 8
 """Photos that are loaded whole at a time; of each, only the part that shows the tile is kept."""
@@ -59,7 +59,7 @@ class Tile:
     coarse: the coarse model.
     number: of the cell, from 0.
     scene: reads the Gaussians of all cells that its training starts from.
-    last: these are the trained tiles, and the last steps are left.
+    last: this and the tiles around it are trained, but for the last steps.
     """
 
     job: Job
