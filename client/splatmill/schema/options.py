@@ -445,11 +445,12 @@ class TrainOptions(Request):
 
     def doubles(self, photos: int) -> bool:
         """Whether a training on so many photos doubles the steps of its preset while that gains enough: where no budget
-        is given, and some of the photos can be set aside to measure it.
+        is given, and some of the photos can be set aside to measure it. A given model may have been trained on them.
         """
         return (
             self.steps is None
             and not self.timed
+            and self.start_model is None
             and (self.target_psnr is not None or photos >= PHOTOS_PER_VALIDATION)
         )
 

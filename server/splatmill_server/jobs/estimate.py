@@ -133,6 +133,8 @@ def _training(
     if options.doubles(trained):
         longest = PRESET_LONGEST * steps
         may = f", or fewer, or up to {longest} while doubling them gains enough"
+    elif options.steps is None and options.start_model is not None:
+        may = ", since the given model may have been trained on the photos that would measure what more gains"
     elif options.steps is None:
         may = f", since {trained} training photos are too few to measure what more would gain"
     elif options.target_psnr is not None:

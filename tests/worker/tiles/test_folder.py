@@ -208,3 +208,28 @@ def test_a_folder_without_a_plan_is_refused(tmp_path: Path, text: str | None, sa
         (tmp_path / "plan.json").write_text(text)
     with pytest.raises(Refusal, match=said):
         PlanFolder.open(tmp_path)
+
+
+def test_failures_that_followed_from_failures_are_forgotten_with_them(shared: PlanFolder) -> None:
+    def fail(name: str) -> None:
+        with shared.claimed(name) as run:
+            run.fail("It diverged.", "")
+
+    for name in ("cameras", "coarse", "tile-2"):
+        do(shared, name)
+    fail("tile-1")
+    fail("seam-2")
+    shared.forget_failures(*shared.plan.part_names)
+    fail("tile-1")
+    assert shared.plan.ready(shared.states()) == ["seam-1", "seam-2"]
+
+
+def test_the_states_of_many_tiles_take_little_time(tmp_path: Path) -> None:
+    options = TrainOptions.model_validate({"tiles": 1024})
+    many = PlanFolder(tmp_path, ScenePlan("d", options))
+    for name in ("cameras", "coarse", *many.plan.tile_names[:-1]):
+        path = many.root / "units" / f"{name}-{many.plan.key(name, {})}"
+        path.mkdir(parents=True)
+        (path / "done.json").write_text("{}")
+    assert len(many.states()) == 1025
+    assert many.plan.ready(many.states()) == ["tile-1024"]

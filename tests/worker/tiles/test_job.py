@@ -129,11 +129,14 @@ def test_a_failed_tile_is_said_and_the_scene_is_made_without_it(tmp_path: Path) 
         with folder.claimed("tile-1") as run:
             run.fail("Nothing shows it.", "")
 
-    outcome, events = run(tmp_path, Play(fail))
+    others = Play(fail)
+    outcome, events = run(tmp_path, others)
     said = [event.message for event in events if isinstance(event, LogEvent) and event.level == "warning"]
     assert any("Tile 1 of 2 failed" in message and "Nothing shows it." in message for message in said)
     report = json.loads((outcome.out / "report.json").read_text())
     assert any("Tile 1 of 2 failed" in warning for warning in report["warnings"])
+    assert others.offered == ["tile-1", "tile-2"], "nobody else knows that tile 1 failed"
+    assert not any("0 Gaussians" in event.message for event in events if isinstance(event, LogEvent))
     assert report["curve"][-1]["step"] == 50 + 50
 
 

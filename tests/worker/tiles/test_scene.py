@@ -22,7 +22,7 @@ from splatmill.schema import Backend, ModelCameras, Report, TrainOptions
 from splatmill_worker import pipeline
 from splatmill_worker.kernels.gpu.device import absence
 from splatmill_worker.splat.formats import registry
-from splatmill_worker.splat.plan.rates import RateSchedule
+from splatmill_worker.splat.plan.rates import RateSchedule, boost_of
 from splatmill_worker.tiles import coarse_model, command
 from splatmill_worker.tiles.folder import PlanFolder
 from splatmill_worker.tiles.tile import tile_plan
@@ -118,12 +118,16 @@ def test_a_tile_goes_on_where_the_coarse_model_stopped(whole: Path) -> None:
     last = tile_plan(coarse, free=500, photos=9, last=True)
     assert (plan.schedule.budget.steps, last.schedule.budget.steps) == (80, 20)
     assert (last.densify, last.max_gaussians) == (False, 500)
-    assert last.schedule.earlier_visits == (coarse.steps + 80) / len(coarse.viewmats)
+    assert last.schedule.earlier_visits == coarse.steps / len(coarse.viewmats) + 80 / 9
     first_ends, last_begins = (
         RateSchedule(1.0, each.schedule.annealing).at(progress)
         for each, progress in ((plan, 1.0), (last, 0.0))
     )
     assert first_ends == last_begins
+    doubled = replace(coarse, steps=4000)  # the course of a run that was laid out for fewer steps
+    for part in (tile_plan(doubled, 500, 9, last=last).schedule for last in (False, True)):
+        assert part.budget.steps is not None
+        assert part.annealing.boost == boost_of(4000) < boost_of(part.budget.steps)
     late = replace(plan.schedule, dropout=0.2, earlier_visits=150.0)
     assert late.left_out(0.0) == pytest.approx(0.1)
     assert late.left_out(50.0) == pytest.approx(0.2)

@@ -15,7 +15,7 @@ UNREPORTED_STATUS = 76
 """Exit status of an attempt that gave up waiting for Redis. Its files are kept, so that the next attempt continues."""
 
 WITHDRAWN_STATUS = 77
-"""Exit status of an attempt that ended before it began, because its job was cancelled meanwhile."""
+"""Exit status of an attempt whose job was cancelled before it began, and of a tile that its job needs no longer."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class ProcessExit:
 
     @property
     def withdrawn(self) -> bool:
-        """Whether the attempt found that its job had been cancelled before it began."""
+        """Whether the process found that its job needs it no longer."""
         return self._exit_status == WITHDRAWN_STATUS
 
     @property

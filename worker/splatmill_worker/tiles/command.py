@@ -137,12 +137,12 @@ def _do_one(root: Path, name: str) -> int:
             advice=f"splatmill unit {root} does all units in their order.",
         )
     if folder.states().get(name) == "failed":
-        by = folder.running("scene")
-        if name in folder.plan.unit("scene").optional and by is not None:
-            print(
-                f"The scene without {name} is being made by {by}; try again when it is done.", file=sys.stderr
-            )
-            return CLAIMED
+        states = folder.states()
+        without = [unit.name for unit in folder.plan.units if name in unit.optional]
+        for other, by in ((other, folder.running(other, states)) for other in without):
+            if by is not None:
+                print(f"{other} is made without {name} by {by}; try again when it is done.", file=sys.stderr)
+                return CLAIMED
         folder.forget_failures(name)
     stopped = _StopSignals()
     try:
@@ -201,7 +201,7 @@ def _do_all(root: Path) -> int:
         ready = folder.plan.ready(states)
         if not ready:
             break
-        free = [name for name in ready if folder.running(name) is None]
+        free = [name for name in ready if folder.running(name, states) is None]
         if not free:
             time.sleep(POLL_SECONDS)
         for name in free[:1]:
@@ -274,7 +274,7 @@ def _rows(folder: PlanFolder) -> list[dict[str, Any]]:
             row |= {"state": "failed", "why": f"{end.failure} {end.advice}".strip()}
         elif missing := folder.plan.missing(unit.name, states):
             row |= {"state": "waiting", "why": f"needs {listed(missing, 3)}"}
-        elif (by := folder.running(unit.name)) is not None:
+        elif (by := folder.running(unit.name, states)) is not None:
             row |= {"state": "running", "why": by}
         else:
             row |= {"state": "ready"}

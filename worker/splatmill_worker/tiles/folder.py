@@ -138,9 +138,9 @@ class PlanFolder:
             states[unit.name] = found[unit.name].state
         return found
 
-    def running(self, name: str) -> str | None:
-        """Which process runs the unit, as text; None where none does."""
-        claim = self._path(name, self.states()).with_suffix(".claim")
+    def running(self, name: str, states: dict[str, State] | None = None) -> str | None:
+        """Which process runs the unit, as text; None where none does. states: those there are, where they are known."""
+        claim = self._path(name, self.states() if states is None else states).with_suffix(".claim")
         document = _read(claim)
         try:
             if document is None or self._age(claim) > CLAIM_SECONDS or _has_ended(claim):
@@ -152,9 +152,10 @@ class PlanFolder:
     def forget_failures(self, *names: str) -> None:
         """Let units that failed be run again."""
         states = self.states()
-        for name in names:
-            states.pop(name, None)
-            self._path(name, states).with_suffix(".failed.json").unlink(missing_ok=True)
+        # Before any is removed: the failures of units that did without others are named after these.
+        failures = [self._path(name, states).with_suffix(".failed.json") for name in names]
+        for failure in failures:
+            failure.unlink(missing_ok=True)
 
     @contextmanager
     def claimed(self, name: str) -> Iterator[Run]:

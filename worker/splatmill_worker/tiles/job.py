@@ -145,10 +145,13 @@ def _step(work: _Work) -> None:
     if work.cancelled():
         raise Cancelled
     folder, others = work.folder, work.others
-    ready = folder.plan.ready(folder.states())
+    states = folder.states()
+    ready = folder.plan.ready(states)
     tiles = [name for name in ready if name in folder.plan.part_names]
-    if tiles:
-        others.offer(tiles)
+    # What failed here is not known elsewhere: the last steps beside a tile that failed are left to this process.
+    offered = [name for name in tiles if "failed" not in map(states.get, folder.plan.unit(name).needs)]
+    if offered:
+        others.offer(offered)
     free = next((name for name in ready if name not in tiles or others.take_back(name)), None)
     others.gather(folder)  # what has ended since
     if free is None:
@@ -195,18 +198,19 @@ def _do(work: _Work, name: str) -> None:
         work.workdir.joinpath(PLAN_FILE).unlink(missing_ok=True)
     elif name in folder.plan.part_names:
         facts = facts_of(run.path)
-        message = f"{name} is trained: {facts['gaussians']:,} Gaussians, {facts['photos']} photos."
-        work.emit(LogEvent(message=message))
+        if facts["photos"]:
+            message = f"{name} is trained: {facts['gaussians']:,} Gaussians, {facts['photos']} photos."
+            work.emit(LogEvent(message=message))
 
 
 def _wait(work: _Work, tiles: Sequence[str]) -> None:
     """Wait for tiles that other processes do."""
-    count = work.folder.plan.tiles
+    parts, states = work.folder.plan.part_names, work.folder.states()
     work.emit(
         ProgressEvent(
             stage="tiles",
-            done=count - len(tiles),
-            total=count,
+            done=sum(name in states for name in parts),
+            total=len(parts),
             note=f"waiting for {listed(tiles, 4)}, which other workers train",
         )
     )

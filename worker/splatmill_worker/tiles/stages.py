@@ -178,10 +178,10 @@ def _tile(context: Context, stages: Stages) -> dict[str, Any]:
     context.run.out.mkdir(exist_ok=True)
     if number > len(coarse.cells):
         return {"gaussians": 0, "steps": 0, "photos": 0}  # the coarse model could not be divided further
-    cameras, ended = joined.known_cameras(job, stages), context.folder.ended()
+    ended = context.folder.ended()
     if last and ended[tile_name(number)].path is None:
         return {"gaussians": 0, "steps": 0, "photos": 0}  # the scene has the coarse model there
-    own = coarse.cells[number - 1]
+    cameras, own = joined.known_cameras(job, stages), coarse.cells[number - 1]
 
     def scene() -> Gaussians:
         if not last:

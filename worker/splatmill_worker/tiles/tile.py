@@ -33,6 +33,7 @@ from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.plan.budget import Budget
 from splatmill_worker.splat.plan.photos import BYTES_PER_PIXEL, fit_in_memory, statistics_memory
 from splatmill_worker.splat.plan.plan import Plan
+from splatmill_worker.splat.plan.rates import boost_of
 from splatmill_worker.splat.train.loop import Hooks, train
 from splatmill_worker.splat.train.observers import TrainingProgress
 from splatmill_worker.splat.views import TrainingView
@@ -157,14 +158,20 @@ def tile_plan(coarse: Coarse, free: int, photos: int, *, last: bool = False) -> 
 
     last: of its last steps, in which no Gaussians are added.
 
-    All its steps are as many as the coarse training took, and it sets no photo aside: the coarse model has been trained
-    on all of them, so that they could judge no more.
+    All its steps are as many as the coarse training took, but at least two. It sets no photo aside: the coarse model
+    has been trained on all of them, so that they could judge no more.
     """
     plan, schedule = coarse.plan, coarse.plan.schedule
-    until = 1.0 - LAST
-    first = max(1, round(until * coarse.steps))
+    until, boost = 1.0 - LAST, schedule.annealing.boost
+    first = max(1, min(coarse.steps - 1, round(until * coarse.steps)))
     steps = max(1, coarse.steps - first) if last else first
-    before = coarse.steps + first if last else coarse.steps
+    assert boost is not None
+    annealing = replace(
+        schedule.annealing,
+        boost=min(boost, boost_of(max(1, coarse.steps))),
+        begin=until if last else 0.0,
+        end=1.0 if last else until,
+    )
     most = free if last else max(free, math.ceil(coarse.most * free / max(1, coarse.gaussians.count)))
     return replace(
         plan,
@@ -186,8 +193,8 @@ def tile_plan(coarse: Coarse, free: int, photos: int, *, last: bool = False) -> 
             longest=None,
             resolution=((0, 1),),
             densify_until=min(1.0, schedule.densify_until / until),
-            annealing=replace(schedule.annealing, begin=until if last else 0.0, end=1.0 if last else until),
-            earlier_visits=before / max(1, len(coarse.viewmats)),
+            annealing=annealing,
+            earlier_visits=coarse.steps / max(1, len(coarse.viewmats)) + (first / photos if last else 0.0),
         ),
     )
 

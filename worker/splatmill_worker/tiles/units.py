@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 from splatmill.schema import TrainOptions
@@ -54,36 +55,45 @@ class ScenePlan:
         assert self.options.tiles is not None
         return self.options.tiles
 
-    @property
+    @cached_property
     def tile_names(self) -> tuple[str, ...]:
         """The units that train the tiles. They need no other's output but those of the cameras and the coarse model."""
         return tuple(tile_name(number) for number in range(1, self.tiles + 1))
 
-    @property
+    @cached_property
     def seam_names(self) -> tuple[str, ...]:
         """The units that train each tile to its end, with what the others were trained to around it."""
         return tuple(seam_name(number) for number in range(1, self.tiles + 1))
 
-    @property
+    @cached_property
     def part_names(self) -> tuple[str, ...]:
         """The units that several machines do at a time, in the order of their numbers in the queue, from 1."""
         return self.tile_names + self.seam_names
 
-    @property
+    @cached_property
     def units(self) -> tuple[Unit, ...]:
         """All units, each after those that it needs."""
         tiles, seams = self.tile_names, self.seam_names
+        beside = ("cameras", "coarse", *tiles)
         return (
             Unit("cameras"),
             Unit("coarse", ("cameras",)),
             *(Unit(name, ("cameras", "coarse")) for name in tiles),
-            *(Unit(name, ("cameras", "coarse", *tiles), tiles) for name in seams),
-            Unit("scene", ("cameras", "coarse", *tiles, *seams), tiles + seams),
+            *(Unit(name, beside, tiles) for name in seams),
+            Unit("scene", beside + seams, tiles + seams),
         )
 
     def unit(self, name: str) -> Unit:
         """The unit of that name. Raises KeyError."""
-        return next((unit for unit in self.units if unit.name == name), None) or _unknown(name)
+        return self._by_name[name]
+
+    @cached_property
+    def _by_name(self) -> dict[str, Unit]:
+        return {unit.name: unit for unit in self.units}
+
+    @cached_property
+    def _chosen(self) -> dict[str, Any]:
+        return self.options.model_dump(mode="json")
 
     def key(self, name: str, states: Mapping[str, State]) -> str:
         """A digest of all that the output of a unit follows from: equal keys, equal outputs.
@@ -91,7 +101,7 @@ class ScenePlan:
         states: of the units, by which the scene without a failed tile has another key than the scene with it.
         """
         own: dict[str, Any] = {"format": FORMAT, "unit": name, "capture": self.digest}
-        options = self.options.model_dump(mode="json")
+        options = self._chosen
         if name == "cameras":
             own["options"] = {option: options[option] for option in CAMERA_OPTIONS}
         else:
@@ -145,7 +155,3 @@ def seam_name(number: int) -> str:
 def tile_number(name: str) -> int:
     """The number of the tile that a unit trains, from 1. name: of a tile or a seam."""
     return int(name.partition("-")[2])
-
-
-def _unknown(name: str) -> Unit:
-    raise KeyError(name)

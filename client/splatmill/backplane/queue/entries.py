@@ -1,8 +1,8 @@
 """The entries of the job queue: RQ's records, and all settings that differ from RQ's defaults.
 
 An entry is one generation of a Splatmill job, and each run of it is an attempt. Where a scene is trained in tiles, its
-attempt adds an entry for each, which other workers may take. The server does not import the worker: which function runs
-an attempt or a tile is decided there.
+attempt adds an entry for each, and later for its last steps, which other workers may take. The server does not import
+the worker: which function runs an attempt or a tile is decided there.
 """
 
 import redis
@@ -91,7 +91,7 @@ def split_rq_id(text: str) -> tuple[str, int]:
 
 
 def tile_of(text: str) -> int | None:
-    """Return the tile in an id of RQ; None for the id of a generation."""
+    """Return the number of a unit in an id of RQ; None for the id of a generation."""
     return None if _whole(text) == text else int(text.rpartition("_")[2])
 
 

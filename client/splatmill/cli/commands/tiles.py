@@ -36,7 +36,7 @@ def plan(
     ],
     **options: Any,
 ) -> None:
-    """Plan a scene in tiles: cameras, a coarse model, tiles, and the model that they make, each a unit in DIR.
+    """Plan a scene in tiles: cameras, a coarse model, tiles, their last steps, and the model, each a unit in DIR.
 
     `splatmill unit DIR` does the units, on this machine and on every other that sees DIR. A plan that is made again
     with other options keeps what does not depend on them. Without `--tiles`, there are four.

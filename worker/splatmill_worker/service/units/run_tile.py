@@ -73,7 +73,7 @@ def run_tile(entry: TileEntry) -> None:
         error = disk.error or caught
         if not isinstance(error, WorkerError):
             raise
-        log.warning("tile %d of the job %s failed here: %s", entry.tile, entry.job_id, error)
+        log.warning("unit %d of the job %s failed here: %s", entry.tile, entry.job_id, error)
     finally:
         watch.close()
         disk.close()
@@ -119,7 +119,7 @@ def _row_or_exit(entry: TileEntry) -> JobRow:
     """
     row = patiently(lambda: _row_to_help(entry))
     if row is None:
-        log.info("the job %s needs its tile %d no longer", entry.job_id, entry.tile)
+        log.info("the job %s needs its unit %d no longer", entry.job_id, entry.tile)
         os._exit(WITHDRAWN_STATUS)
     return row
 
