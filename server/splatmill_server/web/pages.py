@@ -23,8 +23,20 @@ PAGE = Tree(Path(__file__).parent / "page")
 VENDOR = Tree(Path(__file__).parent / "vendor")
 """JavaScript of others, which `server/web/packages.py` fetches."""
 
+HEAD_HERE = "<!-- head -->"
+"""Where a page's HEAD goes."""
+
 IMPORT_MAP_HERE = "<!-- import map -->"
-"""Where a page's import map goes."""
+"""Where the import map goes in HEAD."""
+
+HEAD = f"""<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark">
+<link rel="icon" href="/page/icon.svg" type="image/svg+xml">
+<script src="/page/theme.js"></script>
+{IMPORT_MAP_HERE}
+<link rel="stylesheet" href="/page/base.css">"""
+"""What the heads of all pages have in common."""
 
 POSTER_HERE = "<!-- poster -->"
 """Where the picture of a shared model goes, which browsers show before any script has run."""
@@ -138,6 +150,7 @@ def page(
     imports = import_map(root)
     text = (
         file.path.read_text(encoding="utf-8")
+        .replace(HEAD_HERE, HEAD, 1)
         .replace(POSTER_HERE, poster, 1)
         .replace('"/page/', f'"/page/{PAGE.digest}/')
         .replace('="/', f'="{root}')
