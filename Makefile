@@ -24,7 +24,7 @@ REDIS_TESTS := tests/server/jobs tests/worker/service tests/service/test_up.py t
 # they start is no part of this `make`.
 PYTEST := env -u PYTHONDONTWRITEBYTECODE -u MAKEFLAGS $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
-.PHONY: FORCE help install demo quick test redis fresh coverage check ruff types rules mutants generated wheels docs screenshots walk pictures bench soak capacity fleet load abuse fuzz serve sanitize clean
+.PHONY: FORCE help install demo quick test redis fresh coverage check ruff types rules mutants generated wheels docs screenshots pictures bench soak capacity fleet load abuse fuzz serve sanitize clean
 
 help: ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -84,9 +84,6 @@ docs: $(VENV)/.installed-dev ## build the documentation into docs/build/html, wi
 
 screenshots: $(VENV)/.installed-dev ## make the documentation's pictures of the web page (needs a browser; some minutes)
 	PYTHONPATH=server $(BIN)/python -m docs.screenshots
-
-walk: $(VENV)/.installed-dev ## walk the pages as a new user, at three sizes and in two themes; pictures in demo/walk (some minutes)
-	PYTHONPATH=server $(BIN)/python -m tests.support.page.first_hour demo/walk
 
 pictures: $(VENV)/.installed ## make the documentation's pictures of what photos do to a model (some minutes)
 	$(BIN)/python docs/pictures.py

@@ -17,7 +17,6 @@ from PIL import Image
 from playwright.sync_api import Error, Page, sync_playwright
 
 from tests.browser.conftest import FLAGS
-from tests.support.page.first_hour import DRAWN
 from tests.support.programs import program
 from tests.support.up import Up
 
@@ -28,6 +27,12 @@ WIDTH = 960
 
 CHECKED = "() => /photos/.test(summary.textContent) && !/checked/.test(summary.textContent)"
 """Whether the page has looked at all photos."""
+
+DRAWN = """() => {
+  const view = document.querySelector(".view");
+  return view?.dataset.frames > 0 && !view.querySelector("img") && !view.querySelector(".said").textContent;
+}"""
+"""Whether the view shows the model, and neither its picture nor that it is being loaded."""
 
 PHOTOS = 30
 OPTIONS = {"time_budget": "60s"}

@@ -15,10 +15,9 @@ from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 
 import redis
-from pydantic import ValidationError
 
 from splatmill.backplane.storage import layout
-from splatmill.backplane.storage.records import FORMAT, check_format, reason, warn
+from splatmill.backplane.storage.records import FORMAT, read_record
 from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import (
     HELD_OUT,
@@ -190,15 +189,8 @@ class Shares:
 
     def _load(self, path: str) -> StoredShare | None:
         """Return a link, or None for one that is missing, or not readable in every part: it opens nothing then."""
-        try:
-            record = json.loads(self.storage.get(path))
-            check_format(record)
-            return StoredShare.model_validate(record)
-        except FileNotFoundError:
-            return None
-        except (ValueError, TypeError, AttributeError, ValidationError) as error:
-            warn(path, f"the link is not accepted, because it cannot be read: {reason(error)}")
-            return None
+        outcome = "the link is not accepted, because it cannot be read"
+        return read_record(self.storage, path, StoredShare, outcome)
 
     def _store(self, share: StoredShare) -> None:
         record = share.model_dump(mode="json", exclude_none=True)

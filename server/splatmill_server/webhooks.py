@@ -7,7 +7,6 @@ id of a delivery follows from the job and its generation, and only one process c
 
 import base64
 import hashlib
-import json
 import math
 import secrets
 import time
@@ -18,7 +17,7 @@ from datetime import UTC, datetime, timedelta
 import structlog
 
 from splatmill.backplane.storage import layout
-from splatmill.backplane.storage.records import FORMAT, warn
+from splatmill.backplane.storage.records import FORMAT, read_record
 from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import (
     CreateWebhook,
@@ -137,14 +136,7 @@ class Webhooks:
 
     def get_or_none(self, webhook_id: str) -> WebhookRecord | None:
         """Return a webhook, or None if there is none, or none that can be read."""
-        path = layout.webhook_record(webhook_id)
-        try:
-            return WebhookRecord.model_validate(json.loads(self.storage.get(path)))
-        except FileNotFoundError:
-            return None
-        except ValueError as error:
-            warn(path, str(error).splitlines()[0])
-            return None
+        return read_record(self.storage, layout.webhook_record(webhook_id), WebhookRecord)
 
     def get(self, webhook_id: str) -> WebhookRecord:
         """Return a webhook. Raises a 404 problem."""
@@ -196,14 +188,7 @@ class Webhooks:
 
     def get_delivery(self, webhook_id: str, delivery_id: str) -> DeliveryRecord | None:
         """Return a delivery, or None if there is none, or none that can be read."""
-        path = layout.delivery_record(webhook_id, delivery_id)
-        try:
-            return DeliveryRecord.model_validate(json.loads(self.storage.get(path)))
-        except FileNotFoundError:
-            return None
-        except ValueError as error:
-            warn(path, str(error).splitlines()[0])
-            return None
+        return read_record(self.storage, layout.delivery_record(webhook_id, delivery_id), DeliveryRecord)
 
     def repeat(self, webhook_id: str, delivery_id: str) -> Delivery:
         """Send a delivery that is over once more, with the same message id. Raises a 404 problem."""

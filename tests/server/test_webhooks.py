@@ -409,6 +409,21 @@ def test_old_deliveries_are_deleted_and_unreadable_records_harm_no_other(
     assert json.loads(app.http.get("/v1/webhooks").text)["webhooks"] != []
 
 
+def test_a_record_that_cannot_be_read_is_logged_without_its_secret(
+    app: ServedApp, peer: ScriptedServer, caplog: pytest.LogCaptureFixture
+) -> None:
+    made = webhook(app, peer)
+    path = layout.webhook_record(made["id"])
+    record = json.loads(app.service.storage.get(path))
+    del record["secrets"][0]["value"]
+    app.service.storage.put(path, json.dumps(record | {"url": None, "name": made["secret"]}).encode())
+    assert app.service.webhooks.get_or_none(made["id"]) is None
+    [warned] = [entry.getMessage() for entry in caplog.records if entry.name == "splatmill.records"]
+    assert warned.startswith(f"{path}: cannot be read: url: ")
+    assert "secrets.0.value: Field required" in warned
+    assert made["secret"] not in warned
+
+
 @pytest.mark.parametrize(
     "wished", ["9" * 5000, "-1", "\u00b2", "Mon, 01 Jan 2024 00:00:00 +99999999999999999999"]
 )

@@ -2,12 +2,21 @@
 
 import inspect
 from collections.abc import Callable
-from typing import Any, Literal
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
 import typer
 
 from splatmill.schema.base import Request
 from splatmill.schema.options import OptionHelp, TrainOptions, describe_options
+
+Photos = Annotated[
+    Path,
+    typer.Argument(
+        metavar="PATH", help="Folder of photos, zip archive, video, or posed data set.", show_default=False
+    ),
+]
+"""The argument of commands that train."""
 
 PANELS = {
     "budget": "Length and size of the training",

@@ -23,7 +23,7 @@ from starlette.concurrency import run_in_threadpool
 
 from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.errors import StorageBusyError, StorageStalledError
-from splatmill.backplane.storage.records import FORMAT, check_format, reason, warn
+from splatmill.backplane.storage.records import FORMAT, read_record
 from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import CreateKey, Key, KeyWithSecret, Scope, Time
 from splatmill_server.base.leases import exclusive
@@ -252,19 +252,9 @@ class Keys:
 
     def _load(self, key_id: str) -> StoredKey | None:
         """Return the key of a record, or None for one that is not readable in every part: no limit may get lost."""
-        try:
-            record = json.loads(self.storage.get(layout.key_record(key_id)))
-            check_format(record)
-            key = StoredKey.model_validate(record)
-        except FileNotFoundError:
-            return None
-        except (ValueError, TypeError, AttributeError) as error:
-            warn(
-                layout.key_record(key_id),
-                f"the key is not accepted, because it cannot be read: {reason(error)}",
-            )
-            return None
-        return key if key.id == key_id else None
+        outcome = "the key is not accepted, because it cannot be read"
+        key = read_record(self.storage, layout.key_record(key_id), StoredKey, outcome)
+        return key if key is not None and key.id == key_id else None
 
 
 def digest(secret: str) -> str:

@@ -22,7 +22,7 @@ import structlog
 from starlette.concurrency import run_in_threadpool
 
 from splatmill.backplane.storage import layout
-from splatmill.backplane.storage.records import FORMAT, UnreadableRecord, warn
+from splatmill.backplane.storage.records import FORMAT, UnreadableRecord, read_record
 from splatmill.backplane.storage.storage import Storage, StorageError
 from splatmill.schema import (
     DEFAULT_OWNER,
@@ -274,14 +274,7 @@ class Imports:
             yield chunk
 
     def _read(self, capture_id: str, import_id: str) -> Import | None:
-        path = layout.import_record(capture_id, import_id)
-        try:
-            return Import.model_validate(json.loads(self.storage.get(path)))
-        except FileNotFoundError:
-            return None
-        except ValueError as error:
-            warn(path, str(error).splitlines()[0])
-            return None
+        return read_record(self.storage, layout.import_record(capture_id, import_id), Import)
 
     def _write(self, record: Import) -> None:
         """Store the record, unless its capture was deleted."""

@@ -21,7 +21,7 @@ from starlette.concurrency import run_in_threadpool
 
 from splatmill.backplane import rendering
 from splatmill.backplane.storage import layout
-from splatmill.backplane.storage.records import FORMAT, reason, warn
+from splatmill.backplane.storage.records import FORMAT, read_record
 from splatmill.backplane.storage.storage import Storage, StorageError
 from splatmill.schema import DEFAULT_OWNER, PROBLEMS, Kept, KeptState, Problem
 from splatmill_server.access.caller import Caller
@@ -348,14 +348,8 @@ class KeptOfModels(ABC, Generic[Record]):
         return self._models.get_owner(model_id) or DEFAULT_OWNER
 
     def _read(self, model_id: str, kept_id: str) -> Record | None:
-        path = layout.kept_record(model_id, self.kind, kept_id)
-        try:
-            return self._with_links(self.record.model_validate_json(self._storage.get(path)))
-        except FileNotFoundError:
-            return None
-        except ValueError as error:
-            warn(path, reason(error))
-            return None
+        record = read_record(self._storage, layout.kept_record(model_id, self.kind, kept_id), self.record)
+        return None if record is None else self._with_links(record)
 
     def _put(self, record: Record) -> None:
         fields = record.model_dump(mode="json", exclude_none=True, exclude={"links"}) | {"format": FORMAT}

@@ -10,12 +10,12 @@ import json
 from typing import Any, TypeVar
 
 import redis
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from splatmill.backplane import keys
 from splatmill.backplane.jobs.row import JobRow
 from splatmill.backplane.storage import layout
-from splatmill.backplane.storage.records import FORMAT, UnreadableRecord, check_format, reason, warn
+from splatmill.backplane.storage.records import FORMAT, read_record
 from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import Job, Response
 from splatmill.schema.base import Label
@@ -50,16 +50,7 @@ def labelled(storage: Storage) -> frozenset[str]:
 
 def get(storage: Storage, job_id: str) -> Labels | None:
     """Return the labels of a job, or None if it was given none that can be read."""
-    path = layout.job_labels(job_id)
-    try:
-        record = json.loads(storage.get(path))
-        check_format(record)
-        return Labels.model_validate(record)
-    except FileNotFoundError:
-        return None
-    except (UnreadableRecord, ValidationError, ValueError, TypeError, AttributeError) as error:
-        warn(path, f"cannot be read: {reason(error)}")
-        return None
+    return read_record(storage, layout.job_labels(job_id), Labels)
 
 
 def write(connection: redis.Redis, job_id: str, labels: Labels) -> None:

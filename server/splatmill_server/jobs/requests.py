@@ -12,7 +12,7 @@ import redis
 from splatmill.backplane.jobs import row
 from splatmill.backplane.jobs.row import JobRow
 from splatmill.backplane.storage import layout
-from splatmill.backplane.storage.records import UnreadableRecord, reason, warn
+from splatmill.backplane.storage.records import UnreadableRecord, read_record
 from splatmill.backplane.storage.storage import Storage
 from splatmill_server.jobs import labels
 
@@ -30,15 +30,8 @@ def next_generation(job_row: JobRow, moment: datetime, request: str | None) -> J
 
 def get(storage: Storage, job_id: str, labelled: frozenset[str] | None = None) -> JobRow | None:
     """Return the row of an unfinished job, under its present labels, or None if there is none to read."""
-    path = layout.unfinished_job(job_id)
-    try:
-        begun = JobRow.model_validate_json(storage.get(path))
-    except FileNotFoundError:
-        return None
-    except ValueError as error:
-        warn(path, reason(error))
-        return None
-    return labels.under(storage, job_id, begun, labelled)
+    begun = read_record(storage, layout.unfinished_job(job_id), JobRow)
+    return None if begun is None else labels.under(storage, job_id, begun, labelled)
 
 
 def list_ids(storage: Storage) -> list[str]:

@@ -16,7 +16,7 @@ from splatmill_server.base.problems import ProblemError
 from splatmill_server.requests.ownership import CaptureId, ListedOwner
 from splatmill_server.requests.parameters import JSON_ONLY, Cursor, Limit, NamePart
 from splatmill_server.routes import uploads
-from splatmill_server.routes.openapi import CAPTURE_EXAMPLE, answer, example, problems
+from splatmill_server.routes.openapi import CAPTURE_EXAMPLE, JSON_BODY, answer, example, problems
 from splatmill_server.service import Shared
 from splatmill_server.space.quota import CAPTURE_BYTES, bytes_beside
 
@@ -32,9 +32,7 @@ _ACCEPTED = {
 @router.post(
     "",
     status_code=201,
-    responses=problems(
-        "unsupported_media_type", "malformed_body", "body_too_large", "storage_full", "quota_exceeded"
-    )
+    responses=problems(*JSON_BODY, "storage_full", "quota_exceeded")
     | answer(200, "The capture that an earlier request with the same `key` has made", model=Capture)
     | example(201, CAPTURE_EXAMPLE | {"files": []}, "The new, empty capture"),
     dependencies=[JSON_ONLY],

@@ -11,7 +11,7 @@ from splatmill.schema import CreateImport, Import, ImportList
 from splatmill_server.access.caller import Who
 from splatmill_server.requests.ownership import CaptureId
 from splatmill_server.requests.parameters import JSON_ONLY
-from splatmill_server.routes.openapi import problems
+from splatmill_server.routes.openapi import JSON_BODY, problems
 from splatmill_server.service import Shared
 from splatmill_server.space.quota import RECORD_BYTES
 
@@ -26,9 +26,7 @@ router = APIRouter(prefix="/v1/captures", tags=["captures"])
         "url_refused",
         "name_invalid",
         "too_many_requests",
-        "body_too_large",
-        "unsupported_media_type",
-        "malformed_body",
+        *JSON_BODY,
         "storage_full",
         "quota_exceeded",
     ),

@@ -9,14 +9,14 @@ from splatmill.schema import CreateKey, Key, KeyList, KeyWithSecret, Me, RotateK
 from splatmill_server.access.caller import Who
 from splatmill_server.access.permission import needs
 from splatmill_server.requests.parameters import JSON_ONLY
-from splatmill_server.routes.openapi import problems
+from splatmill_server.routes.openapi import JSON_BODY, problems
 from splatmill_server.service import Shared
 
 router = APIRouter(prefix="/v1", tags=["keys"])
 
 KeyId = Annotated[str, Path(description="Id of the key, which is also a part of its secret.")]
 
-_BODY = problems("unsupported_media_type", "malformed_body", "body_too_large", "storage_full")
+_BODY = problems(*JSON_BODY, "storage_full")
 _NOT_STORED = {"Cache-Control": "no-store"}  # the answer holds a secret
 
 

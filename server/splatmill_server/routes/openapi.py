@@ -35,6 +35,21 @@ RENDER_REQUESTS = {
         "value": {"camera": CAMERA, "output": "depth", "format": "png"},
     },
 }
+JSON_BODY = ("malformed_body", "unsupported_media_type", "body_too_large")
+"""The problems of a body that is JSON."""
+
+OF_MODEL = ("model_not_found", "model_not_ready")
+"""The problems of what is made of a model."""
+
+CONVERTED = (
+    "model_corrupt",
+    "conversion_failed",
+    "quota_exceeded",
+    "storage_full",
+    "renderer_unavailable",
+    "render_timeout",
+)
+"""The problems of a model in a file format of which it may have to be made first."""
 
 
 def problems(*codes: str) -> Responses:

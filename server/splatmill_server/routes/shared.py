@@ -14,7 +14,7 @@ from splatmill_server.base.problems import ProblemError
 from splatmill_server.base.root_path import address
 from splatmill_server.responses.model_outputs import model_file, model_in_format, rendered_by_query
 from splatmill_server.routes.models.models import CAMERA_QUERY, RENDER_PROBLEMS, RENDERED
-from splatmill_server.routes.openapi import answer, binary, problems
+from splatmill_server.routes.openapi import CONVERTED, answer, binary, problems
 from splatmill_server.service import Shared
 from splatmill_server.shares import StoredShare
 
@@ -92,12 +92,7 @@ def get_shared_formats(
         "model_not_found",
         "format_unknown",
         "range_not_satisfiable",
-        "model_corrupt",
-        "conversion_failed",
-        "quota_exceeded",
-        "storage_full",
-        "renderer_unavailable",
-        "render_timeout",
+        *CONVERTED,
     ),
 )
 async def download_shared(

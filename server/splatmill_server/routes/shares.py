@@ -8,7 +8,7 @@ from starlette.responses import Response
 from splatmill.schema import CreateShare, ShareList, ShareWithToken
 from splatmill_server.requests.ownership import ModelId
 from splatmill_server.requests.parameters import JSON_ONLY
-from splatmill_server.routes.openapi import problems
+from splatmill_server.routes.openapi import JSON_BODY, problems
 from splatmill_server.service import Shared
 
 router = APIRouter(prefix="/v1/models/{model_id}/shares", tags=["shares"])
@@ -17,15 +17,7 @@ router = APIRouter(prefix="/v1/models/{model_id}/shares", tags=["shares"])
 @router.post(
     "",
     status_code=201,
-    responses=problems(
-        "model_not_found",
-        "model_not_ready",
-        "too_many_requests",
-        "unsupported_media_type",
-        "malformed_body",
-        "body_too_large",
-        "storage_full",
-    ),
+    responses=problems("model_not_found", "model_not_ready", "too_many_requests", *JSON_BODY, "storage_full"),
     dependencies=[JSON_ONLY],
 )
 def create_share(

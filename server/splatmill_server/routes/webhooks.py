@@ -12,7 +12,7 @@ from splatmill_server.base.outgoing import OutgoingError
 from splatmill_server.base.problems import ProblemError
 from splatmill_server.requests.ownership import ListedOwner
 from splatmill_server.requests.parameters import JSON_ONLY
-from splatmill_server.routes.openapi import problems
+from splatmill_server.routes.openapi import JSON_BODY, problems
 from splatmill_server.service import Shared
 from splatmill_server.webhooks import webhook_not_found
 
@@ -35,14 +35,7 @@ WebhookId = Annotated[str, Depends(_webhook_id)]
 @router.post(
     "",
     status_code=201,
-    responses=problems(
-        "url_refused",
-        "too_many_requests",
-        "unsupported_media_type",
-        "malformed_body",
-        "body_too_large",
-        "storage_full",
-    ),
+    responses=problems("url_refused", "too_many_requests", *JSON_BODY, "storage_full"),
     dependencies=[JSON_ONLY],
 )
 async def create_webhook(

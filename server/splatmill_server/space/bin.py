@@ -14,7 +14,7 @@ import structlog
 
 from splatmill.backplane import keys
 from splatmill.backplane.storage import layout
-from splatmill.backplane.storage.records import reason, warn
+from splatmill.backplane.storage.records import read_record
 from splatmill.backplane.storage.storage import Storage, StorageError
 from splatmill.schema import BinKind, Binned
 from splatmill_server.base.lists import each
@@ -150,13 +150,7 @@ class Bin:
 
     def _read(self, path: str) -> Binned | None:
         """Return a record of the bin, or None for one that is gone or cannot be read, which deletes nothing."""
-        try:
-            return Binned.model_validate_json(self.storage.get(path))
-        except FileNotFoundError:
-            return None
-        except ValueError as error:
-            warn(path, f"is not read as a record of the bin: {reason(error)}")
-            return None
+        return read_record(self.storage, path, Binned, "is not read as a record of the bin")
 
 
 def _field(binned: Binned) -> str:

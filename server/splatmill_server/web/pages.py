@@ -2,6 +2,7 @@
 show comes from `/v1`, with the session or the key of who looks."""
 
 import json
+from collections.abc import Callable
 from html import escape
 from pathlib import Path
 
@@ -23,8 +24,20 @@ PAGE = Tree(Path(__file__).parent / "page")
 VENDOR = Tree(Path(__file__).parent / "vendor")
 """JavaScript of others, which `server/web/packages.py` fetches."""
 
+HEAD_HERE = "<!-- head -->"
+"""Where a page's HEAD goes."""
+
 IMPORT_MAP_HERE = "<!-- import map -->"
-"""Where a page's import map goes."""
+"""Where the import map goes in HEAD."""
+
+HEAD = f"""<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark">
+<link rel="icon" href="/page/icon.svg" type="image/svg+xml">
+<script src="/page/theme.js"></script>
+{IMPORT_MAP_HERE}
+<link rel="stylesheet" href="/page/base.css">"""
+"""What the heads of all pages have in common."""
 
 POSTER_HERE = "<!-- poster -->"
 """Where the picture of a shared model goes, which browsers show before any script has run."""
@@ -32,62 +45,34 @@ POSTER_HERE = "<!-- poster -->"
 PICTURES = (POSTER, "preview.jpg")
 """The files with a picture of a model, the first before the second."""
 
+PAGES = {
+    "/": "new/new.html",
+    "/jobs": "lists/jobs.html",
+    "/jobs/{job_id}": "job/job.html",
+    "/models": "lists/models.html",
+    "/models/{model_id}": "model/model.html",
+    "/compare": "beside/beside.html",  # two models
+    "/open": "open/open.html",  # a file of the visitor's own, which is not sent to the server
+    "/sign-in": "sign-in/sign-in.html",
+    "/glossary": "plain/glossary.html",
+}
+"""The pages that are the same for everybody, by address."""
+
 _FOREVER = "public, max-age=31536000, immutable"
 _METHODS = ["GET", "HEAD"]
 
 
-@router.api_route("/", methods=_METHODS)
-def new_page(request: Request) -> Response:
-    """The page that takes photos and starts a job."""
-    return page(request, "new/new.html")
+def _shown(name: str) -> Callable[[Request], Response]:
+    """Return the endpoint of the page `name`."""
+
+    def shown(request: Request) -> Response:
+        return page(request, name)
+
+    return shown
 
 
-@router.api_route("/jobs", methods=_METHODS)
-def jobs_page(request: Request) -> Response:
-    """The list of jobs."""
-    return page(request, "lists/jobs.html")
-
-
-@router.api_route("/jobs/{job_id}", methods=_METHODS)
-def job_page(request: Request, job_id: str) -> Response:
-    """One job, live."""
-    return page(request, "job/job.html")
-
-
-@router.api_route("/models", methods=_METHODS)
-def models_page(request: Request) -> Response:
-    """The list of models and what storage they use."""
-    return page(request, "lists/models.html")
-
-
-@router.api_route("/models/{model_id}", methods=_METHODS)
-def model_page(request: Request, model_id: str) -> Response:
-    """One model in the viewer."""
-    return page(request, "model/model.html")
-
-
-@router.api_route("/compare", methods=_METHODS)
-def compare_page(request: Request) -> Response:
-    """Two models side by side."""
-    return page(request, "beside/beside.html")
-
-
-@router.api_route("/open", methods=_METHODS)
-def open_page(request: Request) -> Response:
-    """The viewer for a model file of the visitor's own, which is not sent to the server."""
-    return page(request, "open/open.html")
-
-
-@router.api_route("/sign-in", methods=_METHODS)
-def sign_in_page(request: Request) -> Response:
-    """The page that exchanges a key for a session."""
-    return page(request, "sign-in/sign-in.html")
-
-
-@router.api_route("/glossary", methods=_METHODS)
-def glossary_page(request: Request) -> Response:
-    """What the words of the pages mean."""
-    return page(request, "plain/glossary.html")
+for address, name in PAGES.items():
+    router.add_api_route(address, _shown(name), methods=_METHODS)
 
 
 def missing_page(request: Request) -> Response:
@@ -138,6 +123,7 @@ def page(
     imports = import_map(root)
     text = (
         file.path.read_text(encoding="utf-8")
+        .replace(HEAD_HERE, HEAD, 1)
         .replace(POSTER_HERE, poster, 1)
         .replace('"/page/', f'"/page/{PAGE.digest}/')
         .replace('="/', f'="{root}')

@@ -3,13 +3,12 @@
 Not proved here: how a file is fetched, and what is refused (tests/server/background/test_imports.py, test_outgoing.py).
 """
 
-import asyncio
 import hashlib
 
 import pytest
 from typer.testing import CliRunner
 
-from splatmill import AsyncClient, Client
+from splatmill import Client
 from splatmill.cli.app import app
 from splatmill.cli.exits import Exit
 from splatmill.errors import InvalidRequest, NotFound
@@ -34,6 +33,7 @@ def test_a_file_is_fetched_into_a_capture(service, peer):
         begun = client.imports.start(f"{peer.url}/photo%201.jpg?key=1", sha256=sha256)
         done = client.imports.wait(begun.capture, begun.id, heard.append)
         assert (done.state, done.name) == (ImportState.succeeded, "photo 1.jpg")
+        assert done.file is not None
         assert (heard[-1].done, heard[-1].total) == (len(DATA), len(DATA))
         more = client.imports.start(f"{peer.url}/photo", capture=begun.capture, role="masks", name="a.png")
         assert client.imports.wait(begun.capture, more.id).state is ImportState.succeeded
@@ -54,17 +54,6 @@ def test_a_file_is_fetched_into_a_capture(service, peer):
         with pytest.raises(InvalidRequest, match="sha256"):
             client.imports.start(f"{peer.url}/photo", sha256="short")
         assert [found.id for found in client.captures()] == [begun.capture]
-
-
-def test_the_asynchronous_twin(service, peer):
-    async def life() -> None:
-        async with AsyncClient(service.url) as client:
-            begun = await client.imports.start(f"{peer.url}/photo.jpg")
-            done = await client.imports.wait(begun.capture, begun.id)
-            assert done.file is not None
-            assert [found.id for found in await client.imports.list(begun.capture)] == [begun.id]
-
-    asyncio.run(life())
 
 
 def test_the_command(service, peer):

@@ -1,16 +1,15 @@
-"""Links to a model through the SDK, synchronous and asynchronous, and through `splatmill shares`, on the real server.
+"""Links to a model through the SDK and through `splatmill shares`, on the real server.
 
 Not proved here: what a link opens, and for whom (tests/server/models/test_shares.py).
 """
 
-import asyncio
 import json
 
 import httpx
 import pytest
 from typer.testing import CliRunner
 
-from splatmill import AsyncClient, Client
+from splatmill import Client
 from splatmill.cli.app import app
 from splatmill.errors import InvalidRequest, NotFound
 from tests.support.served_app import store_model
@@ -41,19 +40,8 @@ def test_the_life_of_a_link(url):
             shares.revoke("00000000")
         with pytest.raises(InvalidRequest, match="expires_in"):
             shares.create(expires_in="for ever")
-
-
-def test_the_asynchronous_twin(url):
-    async def live() -> None:
-        async with AsyncClient(url) as client:
-            shares = (await client.model(MODEL)).shares
-            made = await shares.create()
-            assert (made.expires_at - made.created_at).days == 30
-            assert [found.id for found in await shares.list()] == [made.id]
-            await shares.revoke(made.id)
-            assert not (await shares.list())[0].active
-
-    asyncio.run(live())
+        made = shares.create()
+        assert (made.expires_at - made.created_at).days == 30
 
 
 def test_the_command_prints_the_whole_address(url):

@@ -1,15 +1,14 @@
-"""Webhooks through the SDK, synchronous and asynchronous, and through `splatmill webhooks`, against the real server.
+"""Webhooks through the SDK and through `splatmill webhooks`, against the real server.
 
 Not proved here: what is sent and when (tests/server/test_webhooks.py).
 """
 
-import asyncio
 import json
 
 import pytest
 from typer.testing import CliRunner
 
-from splatmill import AsyncClient, Client, verify_webhook
+from splatmill import Client, verify_webhook
 from splatmill.cli.app import app
 from splatmill.errors import InvalidRequest, NotFound
 from splatmill.schema import JobState, Problem, StateEvent, WebhookEvent
@@ -60,23 +59,13 @@ def test_the_life_of_a_webhook(service, peer, tmp_path):
         assert client.webhooks.enable(made.id).disabled_at is None
         client.webhooks.delete(made.id)
         assert client.webhooks.list() == []
+        assert client.webhooks.create(peer.url).events == list(WebhookEvent)
         with pytest.raises(NotFound):
             client.webhooks.deliveries(made.id)
         with pytest.raises(InvalidRequest, match="private"):
             client.webhooks.create("http://10.0.0.1/")
         with pytest.raises(InvalidRequest, match="events"):
             client.webhooks.create(peer.url, events=["job.began"])
-
-
-def test_the_asynchronous_twin(service, peer):
-    async def life() -> None:
-        async with AsyncClient(service.url) as client:
-            made = await client.webhooks.create(peer.url)
-            assert made.events == list(WebhookEvent)
-            assert [webhook.id for webhook in await client.webhooks.list()] == [made.id]
-            await client.webhooks.delete(made.id)
-
-    asyncio.run(life())
 
 
 def test_the_commands(service, peer, tmp_path):

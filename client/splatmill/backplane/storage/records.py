@@ -8,9 +8,17 @@ default and new types of events do not raise it.
 """
 
 import functools
+import json
 import logging
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+if TYPE_CHECKING:
+    from splatmill.backplane.storage.storage import Storage
+
+Model = TypeVar("Model", bound=BaseModel)
 
 FORMAT = 1
 """Version of the format of job rows, events, `job.json` and `capture.json`. A record without one has version 1."""
@@ -34,6 +42,29 @@ def reason(error: Exception) -> str:
     if isinstance(error, KeyError):
         return f"it has no field {error.args[0]!r}"
     return " ".join(str(error).split())[:300]
+
+
+def read_record(
+    storage: "Storage", path: str, model: type[Model], outcome: str = "cannot be read"
+) -> Model | None:
+    """Return a stored record, or None for one that is missing, or not readable in every part. Raises StorageError.
+
+    outcome: what the log says of a record that is not readable, before the reason.
+    """
+    try:
+        record = json.loads(storage.get(path))
+        check_format(record)
+        return model.model_validate(record)
+    except FileNotFoundError:
+        return None
+    except ValidationError as error:
+        # Without the values: some are secret.
+        faults = error.errors(include_url=False, include_context=False, include_input=False)
+        why = "; ".join(f"{'.'.join(map(str, fault['loc']))}: {fault['msg']}" for fault in faults)[:300]
+    except (ValueError, TypeError, AttributeError) as error:
+        why = reason(error)
+    warn(path, f"{outcome}: {why}")
+    return None
 
 
 @functools.lru_cache(maxsize=4096)

@@ -1,12 +1,15 @@
 """`splatmill bin`: puts jobs with their models and captures into the bin of a server, lists and restores them."""
 
 from collections.abc import Callable
-from typing import Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
-from splatmill.cli.display.tables import JsonLines, local_time, print_lines, print_table, printable
+from splatmill.cli.display.tables import JsonLines, local_time, print_list, printable
 from splatmill.cli.servers import ServerOption, open_client
+
+if TYPE_CHECKING:
+    from splatmill.schema import Binned
 
 T = TypeVar("T")
 
@@ -48,16 +51,12 @@ def list_bin(as_json: JsonLines = False, server: ServerOption = None) -> None:
     """List what is in the bin, the newest first."""
     with open_client(server) as client:
         entries = client.bin.list()
-    if as_json:
-        print_lines(entries)
-    elif entries:
-        rows = [
-            (entry.id, entry.kind.value, printable(entry.name or ""), local_time(entry.deleted_at))
-            for entry in entries
-        ]
-        print_table(("id", "kind", "name", "deleted for good"), rows)
-    else:
-        typer.echo("The bin is empty.")
+    print_list(entries, as_json, ("id", "kind", "name", "deleted for good"), _row, "The bin is empty.")
+
+
+def _row(entry: "Binned") -> tuple[str, ...]:
+    """Return the row of a record in the list."""
+    return entry.id, entry.kind.value, entry.name or "", local_time(entry.deleted_at)
 
 
 def _either(record_id: str, of_job: Callable[[str], T], of_capture: Callable[[str], T]) -> T:

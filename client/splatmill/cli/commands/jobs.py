@@ -11,8 +11,8 @@ from splatmill.cli.display.tables import (
     local_time,
     print_facts,
     print_lines,
+    print_list,
     print_record,
-    print_table,
     printable,
 )
 from splatmill.cli.servers import ServerOption, open_client
@@ -65,18 +65,15 @@ def jobs(
             owner=owner,
         )
         listed = list(chosen)
-    if as_json:
-        print_lines(listed)
-    elif listed:
-        rows = [
-            (job.id, job.name or "", job.state.value, _brief_progress(job), local_time(job.created_at))
-            for job in listed
-        ]
-        print_table(("job", "name", "state", "progress", "created"), rows)
-    elif state or name or tag or favourite is not None or capture or owner:
-        typer.echo("No job matches.")
-    else:
-        typer.echo("There are no jobs yet. Start one with: splatmill train PHOTOS --server URL")
+    narrowed = state or name or tag or favourite is not None or capture or owner
+    begin = "There are no jobs yet. Start one with: splatmill train PHOTOS --server URL"
+    none = "No job matches." if narrowed else begin
+    print_list(listed, as_json, ("job", "name", "state", "progress", "created"), _row, none)
+
+
+def _row(job: "Job") -> tuple[str, ...]:
+    """Return the row of a job in the list."""
+    return job.id, job.name or "", job.state.value, _brief_progress(job), local_time(job.created_at)
 
 
 def status(

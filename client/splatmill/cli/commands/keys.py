@@ -4,11 +4,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from splatmill.cli.display.tables import JsonLines, local_time, print_lines, print_table
+from splatmill.cli.display.tables import JsonLines, local_time, print_list
 from splatmill.cli.servers import ServerOption, open_client
 
 if TYPE_CHECKING:
-    from splatmill.schema import KeyWithSecret
+    from splatmill.schema import Key, KeyWithSecret
 
 keys = typer.Typer(
     add_completion=False,
@@ -60,20 +60,8 @@ def list_keys(server: ServerOption = None, as_json: JsonLines = False) -> None:
     """List the keys, the oldest first, without their secrets."""
     with open_client(server) as client:
         listed = client.keys.list()
-    if as_json:
-        print_lines(listed)
-        return
-    if not listed:
-        typer.echo("There are no stored keys. Create one with: splatmill keys create NAME --scope admin")
-        return
-    rows = []
-    for key in listed:
-        limits = ", ".join(
-            f"{name.replace('_', ' ')} {value}" for name, value in key.limits if value is not None
-        )
-        scopes = ", ".join(scope.value for scope in key.scopes)
-        rows.append((key.id, key.name, key.owner, scopes, limits or "none", local_time(key.created_at)))
-    print_table(("key", "name", "owner", "scopes", "limits", "created"), rows)
+    none = "There are no stored keys. Create one with: splatmill keys create NAME --scope admin"
+    print_list(listed, as_json, ("key", "name", "owner", "scopes", "limits", "created"), _row, none)
 
 
 @keys.command()
@@ -98,6 +86,13 @@ def rotate(
     """Give a key a new secret, and print it. The former one is refused at once, or after --grace."""
     with open_client(server) as client:
         _show(client.keys.rotate(key_id, grace=grace))
+
+
+def _row(key: "Key") -> tuple[str, ...]:
+    """Return the row of a key in the list."""
+    limits = ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in key.limits if value is not None)
+    scopes = ", ".join(scope.value for scope in key.scopes)
+    return key.id, key.name, key.owner, scopes, limits or "none", local_time(key.created_at)
 
 
 def _show(key: "KeyWithSecret") -> None:

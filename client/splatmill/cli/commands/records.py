@@ -8,7 +8,7 @@ from splatmill.cli.display.tables import (
     JsonLines,
     local_time,
     print_facts,
-    print_lines,
+    print_list,
     print_record,
     print_table,
 )
@@ -69,13 +69,11 @@ def captures(
             _show_capture(client.capture(capture_id), as_json)
             return
         listed = list(client.captures(name=name, owner=owner, limit=limit))
-    if as_json:
-        print_lines(listed)
-    elif listed:
-        rows = [(entry.id, entry.name or "", local_time(entry.created_at)) for entry in listed]
-        print_table(("capture", "name", "created"), rows)
-    else:
-        typer.echo("No capture is stored." if name is owner is None else "No capture matches.")
+    none = "No capture is stored." if name is owner is None else "No capture matches."
+    columns = ("capture", "name", "created")
+    print_list(
+        listed, as_json, columns, lambda one: (one.id, one.name or "", local_time(one.created_at)), none
+    )
 
 
 def models(
@@ -92,32 +90,24 @@ def models(
     server: ServerOption = None,
 ) -> None:
     """List the finished models, newest first or as --sort says, or show one with its files."""
-    from splatmill.schema import format_bytes
-
     with open_client(server) as client:
         if model_id is not None:
             _show_model(client.model(model_id).model, as_json)
             return
         chosen = client.models(name=name, tag=tag, favourite=favourite, sort=sort, owner=owner, limit=limit)
         listed = list(chosen)
-    if as_json:
-        print_lines(listed)
-    elif listed:
-        rows = [
-            (
-                entry.id,
-                entry.name or "",
-                f"{entry.gaussians:,}",
-                format_bytes(entry.bytes),
-                f"{entry.psnr:.2f} dB" if entry.psnr is not None else "",
-                local_time(entry.created_at),
-            )
-            for entry in listed
-        ]
-        print_table(("model", "name", "Gaussians", "size", "PSNR", "created"), rows)
-    else:
-        narrowed = any(one is not None for one in (name, tag, favourite, owner))
-        typer.echo("No model matches." if narrowed else "No model is finished.")
+    narrowed = any(one is not None for one in (name, tag, favourite, owner))
+    none = "No model matches." if narrowed else "No model is finished."
+    print_list(listed, as_json, ("model", "name", "Gaussians", "size", "PSNR", "created"), _row, none)
+
+
+def _row(model: "Model") -> tuple[str, ...]:
+    """Return the row of a model in the list."""
+    from splatmill.schema import format_bytes
+
+    psnr = f"{model.psnr:.2f} dB" if model.psnr is not None else ""
+    size = format_bytes(model.bytes)
+    return model.id, model.name or "", f"{model.gaussians:,}", size, psnr, local_time(model.created_at)
 
 
 def _show_capture(capture: "Capture", as_json: bool) -> None:

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from splatmill.cli.local.programs import exec_module, require
-from splatmill.cli.schema_options import with_training_options
+from splatmill.cli.schema_options import Photos, with_training_options
 from splatmill.schema import format_bytes
 from splatmill.transfer.local_capture import LocalFile, find_files, printable
 from splatmill.transfer.training_options import train_options
@@ -20,14 +20,7 @@ TILES = 4
 
 @with_training_options
 def plan(
-    path: Annotated[
-        Path,
-        typer.Argument(
-            metavar="PATH",
-            help="Folder of photos, zip archive, video, or posed data set.",
-            show_default=False,
-        ),
-    ],
+    path: Photos,
     out: Annotated[
         Path,
         typer.Option(

@@ -19,7 +19,7 @@ from splatmill.cli.exits import Exit
 from splatmill.cli.local.embedded import embedded_service
 from splatmill.cli.local.folder_lock import locked
 from splatmill.cli.local.unfinished import Unfinished, size_text
-from splatmill.cli.schema_options import with_training_options
+from splatmill.cli.schema_options import Photos, with_training_options
 from splatmill.cli.servers import open_client
 from splatmill.errors import JobCancelled
 from splatmill.schema import Capture, TrainOptions, format_bytes
@@ -36,14 +36,7 @@ DATA = ".splatmill"
 
 @with_training_options
 def train(
-    path: Annotated[
-        Path,
-        typer.Argument(
-            metavar="PATH",
-            help="Folder of photos, zip archive, video, or posed data set.",
-            show_default=False,
-        ),
-    ],
+    path: Photos,
     out: Annotated[
         Path, typer.Option("-o", "--out", metavar="DIR", help="Folder for the results; created if missing.")
     ] = Path("splat"),

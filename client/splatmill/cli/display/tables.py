@@ -2,14 +2,16 @@
 
 import shutil
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from datetime import datetime
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
+
+Record = TypeVar("Record", bound="BaseModel")
 
 JsonLines = Annotated[bool, typer.Option("--json", help="Print one JSON object per line and record.")]
 """The option of commands that list records."""
@@ -38,6 +40,22 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
             row[1] = set_cell_size(row[1], widths[1] - 1) + "…"
         line = _GAP.join(set_cell_size(cell, width) for cell, width in zip(row, widths, strict=True))
         typer.echo(line.rstrip())
+
+
+def print_list(
+    records: Sequence[Record],
+    as_json: bool,
+    columns: Sequence[str],
+    row: Callable[[Record], Sequence[str]],
+    none: str,
+) -> None:
+    """Print records as JSON, or as a table with a row for each, or the sentence `none` where there are none."""
+    if as_json:
+        print_lines(records)
+    elif records:
+        print_table(columns, map(row, records))
+    else:
+        typer.echo(none)
 
 
 def print_facts(facts: Iterable[tuple[str, str]]) -> None:

@@ -9,7 +9,7 @@ from splatmill_server.access.caller import Who
 from splatmill_server.access.permission import needs
 from splatmill_server.jobs.estimate import check_time, estimate
 from splatmill_server.requests.parameters import JSON_ONLY
-from splatmill_server.routes.openapi import problems
+from splatmill_server.routes.openapi import JSON_BODY, problems
 from splatmill_server.service import Shared
 
 router = APIRouter(tags=["jobs"])
@@ -20,9 +20,7 @@ _EXAMPLE = {"photos": 24, "options": {"preset": "draft"}}
 @router.post(
     "/v1/estimate",
     responses=problems(
-        "malformed_body",
-        "unsupported_media_type",
-        "body_too_large",
+        *JSON_BODY,
         "unknown_option",
         "option_out_of_range",
         "capture_not_found",

@@ -17,7 +17,7 @@ from splatmill_server.jobs.listing import By
 from splatmill_server.requests.ownership import JobId, ListedOwner
 from splatmill_server.requests.parameters import JSON_ONLY, Cursor, Favourite, Limit, NamePart, Sort, TagOf
 from splatmill_server.routes.jobs.form import create_from_form
-from splatmill_server.routes.openapi import JOB_REQUESTS, answer, problems
+from splatmill_server.routes.openapi import JOB_REQUESTS, JSON_BODY, answer, problems
 from splatmill_server.service import Service, Shared
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
@@ -155,9 +155,7 @@ def get_job(service: Shared, job_id: JobId) -> Job:
 
 @router.patch(
     "/{job_id}",
-    responses=problems(
-        "job_not_found", "malformed_body", "unsupported_media_type", "body_too_large", "storage_full"
-    ),
+    responses=problems("job_not_found", *JSON_BODY, "storage_full"),
     dependencies=[JSON_ONLY],
 )
 def label_job(service: Shared, job_id: JobId, change: ChangeLabels) -> Job:

@@ -7,7 +7,7 @@ from fastapi import APIRouter, Body
 from splatmill.schema import Scope, Trace, TraceRequest
 from splatmill_server.access.permission import needs
 from splatmill_server.requests.parameters import JSON_ONLY
-from splatmill_server.routes.openapi import CAMERA, problems
+from splatmill_server.routes.openapi import CAMERA, JSON_BODY, problems
 
 router = APIRouter(tags=["models"])
 
@@ -16,7 +16,7 @@ _VIEW = {"camera_to_world": CAMERA["camera_to_world"], "fov_y_deg": 50}
 
 @router.post(
     "/v1/camera-paths",
-    responses=problems("malformed_body", "unsupported_media_type", "body_too_large"),
+    responses=problems(*JSON_BODY),
     dependencies=[JSON_ONLY],
 )
 @needs(Scope.read)

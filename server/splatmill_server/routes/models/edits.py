@@ -19,7 +19,7 @@ from splatmill_server.requests.ownership import ModelId
 from splatmill_server.requests.parameters import JSON_ONLY
 from splatmill_server.responses.forward import CLIENT_GONE, client_of, while_connected
 from splatmill_server.routes.models.models import RENDER_PROBLEMS
-from splatmill_server.routes.openapi import answer, problems
+from splatmill_server.routes.openapi import JSON_BODY, answer, problems
 from splatmill_server.service import Service, Shared
 from splatmill_server.space.quota import Arrival
 
@@ -36,9 +36,7 @@ _EXAMPLE = {"box": {"min": [-1, -1, -1], "max": [1, 1, 1]}, "min_opacity": 0.05,
     response_model=Edited,
     responses=answer(200, "What the edit would do; no model was made")
     | RENDER_PROBLEMS
-    | problems(
-        "malformed_body", "unsupported_media_type", "body_too_large", "storage_full", "quota_exceeded"
-    ),
+    | problems(*JSON_BODY, "storage_full", "quota_exceeded"),
     dependencies=[JSON_ONLY],
 )
 async def edit_model(

@@ -12,14 +12,12 @@ from splatmill_server.access.caller import Who
 from splatmill_server.requests.ownership import ModelId
 from splatmill_server.requests.parameters import JSON_ONLY
 from splatmill_server.responses.files import file_response
-from splatmill_server.routes.openapi import answer, binary, problems
+from splatmill_server.routes.openapi import JSON_BODY, OF_MODEL, answer, binary, problems
 from splatmill_server.service import Shared
 
 router = APIRouter(prefix="/v1/models", tags=["models"])
 
 MeshId = Annotated[str, Path(description="Id of the mesh.")]
-
-_OF_MODEL = ("model_not_found", "model_not_ready")
 
 _MEDIA = {MeshFormat.glb: "model/gltf-binary", MeshFormat.ply: "application/octet-stream"}
 
@@ -29,12 +27,10 @@ _MEDIA = {MeshFormat.glb: "model/gltf-binary", MeshFormat.ply: "application/octe
     status_code=202,
     responses=answer(200, "The mesh of this request, which is there already", model=Mesh)
     | problems(
-        *_OF_MODEL,
+        *OF_MODEL,
         "file_not_found",
         "too_many_meshes",
-        "body_too_large",
-        "unsupported_media_type",
-        "malformed_body",
+        *JSON_BODY,
         "invalid_request",
         "quota_exceeded",
         "storage_full",
@@ -60,20 +56,20 @@ async def create_mesh(
     return made
 
 
-@router.get("/{model_id}/meshes", responses=problems(*_OF_MODEL))
+@router.get("/{model_id}/meshes", responses=problems(*OF_MODEL))
 def list_meshes(service: Shared, model_id: ModelId) -> MeshList:
     """List the meshes of a model, newest first."""
     return MeshList(meshes=service.meshes.list(model_id))
 
 
-@router.get("/{model_id}/meshes/{mesh_id}", responses=problems(*_OF_MODEL, "mesh_not_found"))
+@router.get("/{model_id}/meshes/{mesh_id}", responses=problems(*OF_MODEL, "mesh_not_found"))
 def get_mesh(service: Shared, model_id: ModelId, mesh_id: MeshId) -> Mesh:
     """Get a mesh: its state, what is being done, and its triangles, its size or the problem at its end."""
     return service.meshes.get(model_id, mesh_id)
 
 
 @router.delete(
-    "/{model_id}/meshes/{mesh_id}", status_code=204, responses=problems(*_OF_MODEL, "mesh_not_found")
+    "/{model_id}/meshes/{mesh_id}", status_code=204, responses=problems(*OF_MODEL, "mesh_not_found")
 )
 async def delete_mesh(service: Shared, model_id: ModelId, mesh_id: MeshId) -> None:
     """Delete a mesh; one that is not whole is cancelled."""
@@ -87,7 +83,7 @@ async def delete_mesh(service: Shared, model_id: ModelId, mesh_id: MeshId) -> No
     responses=binary("The mesh", "model/gltf-binary")
     | answer(206, "The requested range of the mesh")
     | answer(304, "The mesh is unchanged")
-    | problems(*_OF_MODEL, "mesh_not_found", "mesh_not_ready", "file_not_found", "range_not_satisfiable"),
+    | problems(*OF_MODEL, "mesh_not_found", "mesh_not_ready", "file_not_found", "range_not_satisfiable"),
 )
 async def get_mesh_file(service: Shared, model_id: ModelId, mesh_id: MeshId, request: Request) -> Response:
     """Download a mesh, in the format of its request."""

@@ -31,7 +31,15 @@ from splatmill_server.responses.files import attachment
 from splatmill_server.responses.forward import CLIENT_GONE, forward, while_connected
 from splatmill_server.responses.model_outputs import file_name, model_file, model_in_format, rendered_by_query
 from splatmill_server.responses.single_file import single_file
-from splatmill_server.routes.openapi import CAMERA, RENDER_REQUESTS, answer, binary, problems
+from splatmill_server.routes.openapi import (
+    CAMERA,
+    CONVERTED,
+    JSON_BODY,
+    RENDER_REQUESTS,
+    answer,
+    binary,
+    problems,
+)
 from splatmill_server.service import Shared
 
 router = APIRouter(prefix="/v1/models", tags=["models"])
@@ -100,15 +108,7 @@ def get_model(service: Shared, model_id: ModelId) -> Model:
 
 @router.patch(
     "/{model_id}",
-    responses=problems(
-        "model_not_found",
-        "model_not_ready",
-        "model_corrupt",
-        "malformed_body",
-        "unsupported_media_type",
-        "body_too_large",
-        "storage_full",
-    ),
+    responses=problems("model_not_found", "model_not_ready", "model_corrupt", *JSON_BODY, "storage_full"),
     dependencies=[JSON_ONLY],
 )
 def label_model(service: Shared, model_id: ModelId, change: ChangeLabels) -> Model:
@@ -140,17 +140,7 @@ def get_formats(service: Shared, model_id: ModelId) -> ModelDownloads:
     "/{model_id}/download/html",
     response_class=Response,
     responses=binary("The model with its viewer in one HTML file", "text/html; charset=utf-8")
-    | problems(
-        "model_not_found",
-        "file_not_found",
-        "model_not_ready",
-        "model_corrupt",
-        "conversion_failed",
-        "quota_exceeded",
-        "storage_full",
-        "renderer_unavailable",
-        "render_timeout",
-    ),
+    | problems("model_not_found", "file_not_found", "model_not_ready", *CONVERTED),
 )
 async def download_html(service: Shared, who: Who, model_id: ModelId, request: Request) -> Response:
     """Download a model with its viewer in one HTML file, which needs no server and sends no request."""
@@ -183,18 +173,7 @@ async def download_html(service: Shared, who: Who, model_id: ModelId, request: R
     responses=binary("The model in this format", *sorted({form.media_type for form in DOWNLOADS.values()}))
     | answer(206, "The requested range of the file")
     | answer(304, "The file is unchanged")
-    | problems(
-        "model_not_found",
-        "format_unknown",
-        "model_not_ready",
-        "range_not_satisfiable",
-        "model_corrupt",
-        "conversion_failed",
-        "quota_exceeded",
-        "storage_full",
-        "renderer_unavailable",
-        "render_timeout",
-    ),
+    | problems("model_not_found", "format_unknown", "model_not_ready", "range_not_satisfiable", *CONVERTED),
 )
 async def download(
     service: Shared,
@@ -219,9 +198,7 @@ def get_cameras(service: Shared, model_id: ModelId) -> ModelCameras:
 @router.post(
     "/{model_id}/render",
     response_class=Response,
-    responses=RENDERED
-    | RENDER_PROBLEMS
-    | problems("malformed_body", "unsupported_media_type", "body_too_large"),
+    responses=RENDERED | RENDER_PROBLEMS | problems(*JSON_BODY),
     dependencies=[JSON_ONLY],
 )
 @needs(Scope.read)
@@ -256,7 +233,7 @@ async def render_cacheable(service: Shared, model_id: ModelId, request: Request)
     responses=binary("The video", "video/mp4")
     | answer(304, "The video is unchanged")
     | RENDER_PROBLEMS
-    | problems("malformed_body", "unsupported_media_type", "body_too_large", "size_out_of_range"),
+    | problems(*JSON_BODY, "size_out_of_range"),
     dependencies=[JSON_ONLY],
 )
 @needs(Scope.read)

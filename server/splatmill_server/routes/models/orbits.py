@@ -12,14 +12,12 @@ from splatmill_server.access.caller import Who
 from splatmill_server.requests.ownership import ModelId
 from splatmill_server.requests.parameters import JSON_ONLY
 from splatmill_server.responses.files import file_response
-from splatmill_server.routes.openapi import answer, binary, problems
+from splatmill_server.routes.openapi import JSON_BODY, OF_MODEL, answer, binary, problems
 from splatmill_server.service import Shared
 
 router = APIRouter(prefix="/v1/models", tags=["models"])
 
 OrbitId = Annotated[str, Path(description="Id of the orbit video.")]
-
-_OF_MODEL = ("model_not_found", "model_not_ready")
 
 
 @router.post(
@@ -27,12 +25,10 @@ _OF_MODEL = ("model_not_found", "model_not_ready")
     status_code=202,
     responses=answer(200, "The video of this request, which is there already", model=Orbit)
     | problems(
-        *_OF_MODEL,
+        *OF_MODEL,
         "file_not_found",
         "too_many_orbits",
-        "body_too_large",
-        "unsupported_media_type",
-        "malformed_body",
+        *JSON_BODY,
         "size_out_of_range",
         "quota_exceeded",
         "storage_full",
@@ -59,20 +55,20 @@ async def create_orbit(
     return made
 
 
-@router.get("/{model_id}/orbits", responses=problems(*_OF_MODEL))
+@router.get("/{model_id}/orbits", responses=problems(*OF_MODEL))
 def list_orbits(service: Shared, model_id: ModelId) -> OrbitList:
     """List the orbit videos of a model, newest first."""
     return OrbitList(orbits=service.orbits.list(model_id))
 
 
-@router.get("/{model_id}/orbits/{orbit_id}", responses=problems(*_OF_MODEL, "orbit_not_found"))
+@router.get("/{model_id}/orbits/{orbit_id}", responses=problems(*OF_MODEL, "orbit_not_found"))
 def get_orbit(service: Shared, model_id: ModelId, orbit_id: OrbitId) -> Orbit:
     """Get an orbit video: its state, the frames rendered so far, and the size or the problem at its end."""
     return service.orbits.get(model_id, orbit_id)
 
 
 @router.delete(
-    "/{model_id}/orbits/{orbit_id}", status_code=204, responses=problems(*_OF_MODEL, "orbit_not_found")
+    "/{model_id}/orbits/{orbit_id}", status_code=204, responses=problems(*OF_MODEL, "orbit_not_found")
 )
 async def delete_orbit(service: Shared, model_id: ModelId, orbit_id: OrbitId) -> None:
     """Delete an orbit video; one that is not whole is cancelled."""
@@ -86,7 +82,7 @@ async def delete_orbit(service: Shared, model_id: ModelId, orbit_id: OrbitId) ->
     responses=binary("The video", "video/mp4")
     | answer(206, "The requested range of the video")
     | answer(304, "The video is unchanged")
-    | problems(*_OF_MODEL, "orbit_not_found", "orbit_not_ready", "file_not_found", "range_not_satisfiable"),
+    | problems(*OF_MODEL, "orbit_not_found", "orbit_not_ready", "file_not_found", "range_not_satisfiable"),
 )
 async def get_orbit_video(
     service: Shared, model_id: ModelId, orbit_id: OrbitId, request: Request

@@ -10,7 +10,7 @@ from splatmill_server.requests.ownership import ModelId
 from splatmill_server.requests.parameters import JSON_ONLY
 from splatmill_server.responses.forward import client_of
 from splatmill_server.routes.models.models import RENDER_PROBLEMS
-from splatmill_server.routes.openapi import problems
+from splatmill_server.routes.openapi import JSON_BODY, problems
 from splatmill_server.service import Shared
 
 router = APIRouter(prefix="/v1/models", tags=["models"])
@@ -26,10 +26,7 @@ def get_presentation(service: Shared, model_id: ModelId) -> Presentation:
 
 @router.patch(
     "/{model_id}/presentation",
-    responses=RENDER_PROBLEMS
-    | problems(
-        "malformed_body", "unsupported_media_type", "body_too_large", "storage_full", "quota_exceeded"
-    ),
+    responses=RENDER_PROBLEMS | problems(*JSON_BODY, "storage_full", "quota_exceeded"),
     dependencies=[JSON_ONLY],
 )
 async def change_presentation(

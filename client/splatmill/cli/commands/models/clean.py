@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from splatmill.cli.commands.models.models import Box
 from splatmill.cli.local.programs import exec_module, require
 
 
@@ -23,15 +24,7 @@ def clean(
             show_default=False,
         ),
     ] = None,
-    box: Annotated[
-        tuple[float, float, float, float, float, float] | None,
-        typer.Option(
-            metavar="X Y Z X Y Z",
-            help="Keep the Gaussians whose centre lies between these two corners, the lower one first, in units of the "
-            "model.",
-            show_default=False,
-        ),
-    ] = None,
+    box: Box = None,
     min_weight: Annotated[
         float | None,
         typer.Option(

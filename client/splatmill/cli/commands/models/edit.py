@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from splatmill.cli.commands.models.models import ModelId
+from splatmill.cli.commands.models.models import Box, ModelId
 from splatmill.cli.display.tables import JsonRecord
 from splatmill.cli.servers import ServerOption, open_client
 
@@ -14,15 +14,7 @@ if TYPE_CHECKING:
 
 def edit(
     model_id: ModelId,
-    box: Annotated[
-        tuple[float, float, float, float, float, float] | None,
-        typer.Option(
-            metavar="X Y Z X Y Z",
-            help="Keep the Gaussians whose centre lies between these two corners, the lower one first, in units of the "
-            "model.",
-            show_default=False,
-        ),
-    ] = None,
+    box: Box = None,
     min_opacity: Annotated[
         float | None,
         typer.Option(help="Keep the Gaussians of at least this opacity, 0 to 1.", show_default=False),

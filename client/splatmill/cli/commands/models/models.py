@@ -18,6 +18,16 @@ ModelId = Annotated[
     typer.Argument(metavar="MODEL", help="Id of the model, which is that of its job.", show_default=False),
 ]
 
+Box = Annotated[
+    tuple[float, float, float, float, float, float] | None,
+    typer.Option(
+        metavar="X Y Z X Y Z",
+        help="Keep the Gaussians whose centre lies between these two corners, the lower one first, in units of the "
+        "model.",
+        show_default=False,
+    ),
+]
+
 FILES = ("model.ply", "report.json", "report.png", "report.html", "cameras.json", "cameras.zip")
 """The files that `train` and `download` write to the output folder."""
 

@@ -1,12 +1,15 @@
 """`splatmill shares`: creates, lists and revokes links to a model."""
 
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from splatmill.cli.commands.models.models import ModelId
-from splatmill.cli.display.tables import JsonLines, local_time, print_lines, print_table
+from splatmill.cli.display.tables import JsonLines, local_time, print_list
 from splatmill.cli.servers import ServerOption, open_client
+
+if TYPE_CHECKING:
+    from splatmill.schema import Share
 
 shares = typer.Typer(
     add_completion=False,
@@ -43,18 +46,15 @@ def list_shares(model_id: ModelId, server: ServerOption = None, as_json: JsonLin
     """List the links to a model, newest first, without their addresses."""
     with open_client(server) as client:
         listed = client.model(model_id).shares.list()
-    if as_json:
-        print_lines(listed)
-        return
-    if not listed:
-        typer.echo(f"There are no links to this model. Create one with: splatmill shares create {model_id}")
-        return
-    rows = []
-    for share in listed:
-        state = "revoked" if share.revoked_at else "valid until" if share.active else "expired"
-        until = local_time(share.revoked_at or share.expires_at)
-        rows.append((share.id, share.name or "", f"{state} {until}"))
-    print_table(("link", "name", "state"), rows)
+    none = f"There are no links to this model. Create one with: splatmill shares create {model_id}"
+    print_list(listed, as_json, ("link", "name", "state"), _row, none)
+
+
+def _row(share: "Share") -> tuple[str, ...]:
+    """Return the row of a link in the list."""
+    state = "revoked" if share.revoked_at else "valid until" if share.active else "expired"
+    until = local_time(share.revoked_at or share.expires_at)
+    return share.id, share.name or "", f"{state} {until}"
 
 
 @shares.command()
