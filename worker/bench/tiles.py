@@ -46,7 +46,7 @@ capture, work, options = sys.argv[1:]
 run = pipeline.run(Path(capture), Path(work), TrainOptions.model_validate_json(options), lambda e: None, lambda: False)
 held_out = run.trained.held_out
 print(json.dumps({"psnr": held_out.psnr, "ssim": held_out.ssim, "gaussians": run.trained.gaussians.count,
-                  "steps": run.trained.steps}))
+                  "trained_steps": run.trained.steps}))
 """
 
 
