@@ -140,7 +140,7 @@ def test_scores_and_extents_of_parts_of_photos_are_brought_to_those_of_whole_one
     assert (change.added, change.removed) == (3, 0)
     engine = Held(gaussians(4), scores)
     engine.max_extent[3] = 2.0 * prune.MAX_SCREEN
-    change = densify(engine, allowed=9)  # type: ignore[arg-type]
+    change = densify(engine, allowed=9)  # type: ignore[arg-type]  # as above
     assert (change.added, change.removed) == (3, 1)
 
 
