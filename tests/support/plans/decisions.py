@@ -111,8 +111,6 @@ NO_DECISION = {
     "schedule.expected_steps": "follows from the end",
     "schedule.in_view": "of which the other fields of the schedule are made",
     "schedule.position_scale": "a factor on a rate in all runs",
-    "schedule.score_scale": "a factor on a threshold in all runs",
-    "schedule.extent_scale": "a factor on a threshold in all runs",
     "seed": "changes no path",
     "reasons": "words",
     "left_out": "words",

@@ -26,7 +26,6 @@ from splatmill_worker.splat.plan.rates import RateSchedule, boost_of
 from splatmill_worker.tiles import coarse_model, command
 from splatmill_worker.tiles.folder import PlanFolder
 from splatmill_worker.tiles.tile import tile_plan
-from splatmill_worker.tiles.visibility import Enlarged
 from tests.support import still_life
 from tests.support.made_once import made_once
 
@@ -35,8 +34,6 @@ pytestmark = pytest.mark.slow
 OPTIONS = TrainOptions.model_validate(
     {"steps": 200, "seed": 1, "max_gaussians": 3000, "holdout": 5, "tiles": 2}
 )
-
-WHOLE = [Enlarged(1.0, 1.0)] * 9
 
 
 def planned(photos: Path, root: Path, **options: int) -> str:
@@ -113,12 +110,12 @@ def test_a_tile_goes_on_where_the_coarse_model_stopped(whole: Path) -> None:
     path = PlanFolder.open(whole).ended()["coarse"].path
     assert path is not None
     coarse = coarse_model.read(path)
-    plan = tile_plan(coarse, free=500, parts=WHOLE)
+    plan = tile_plan(coarse, free=500, photos=9)
     assert coarse.steps == 100
     assert plan.schedule.earlier_visits == coarse.steps / len(coarse.viewmats)
     assert plan.schedule.reduced_until == 0
     assert plan.max_gaussians == pytest.approx(3000 * 500 / coarse.gaussians.count, abs=1)
-    last = tile_plan(coarse, free=500, parts=WHOLE, last=True)
+    last = tile_plan(coarse, free=500, photos=9, last=True)
     assert (plan.schedule.budget.steps, last.schedule.budget.steps) == (80, 20)
     assert (last.densify, last.max_gaussians) == (False, 500)
     assert last.schedule.earlier_visits == coarse.steps / len(coarse.viewmats) + 80 / 9
@@ -128,11 +125,9 @@ def test_a_tile_goes_on_where_the_coarse_model_stopped(whole: Path) -> None:
     )
     assert first_ends == last_begins
     doubled = replace(coarse, steps=4000)  # the course of a run that was laid out for fewer steps
-    for part in (tile_plan(doubled, 500, WHOLE, last=last).schedule for last in (False, True)):
+    for part in (tile_plan(doubled, 500, 9, last=last).schedule for last in (False, True)):
         assert part.budget.steps is not None
         assert part.annealing.boost == boost_of(4000) < boost_of(part.budget.steps)
-    enlarged = tile_plan(coarse, 500, [Enlarged(2.0, 3.0), Enlarged(4.0, 5.0)]).schedule
-    assert (enlarged.score_scale, enlarged.extent_scale) == (3.0, 5.0)
     late = replace(plan.schedule, dropout=0.2, earlier_visits=150.0)
     assert late.left_out(0.0) == pytest.approx(0.1)
     assert late.left_out(50.0) == pytest.approx(0.2)
@@ -143,7 +138,7 @@ def test_a_tile_sets_no_photo_aside_that_the_coarse_model_was_trained_on(whole: 
     assert path is not None
     coarse = coarse_model.read(path)
     watched = replace(coarse.plan, validation=2, stops_when_flat=True, target_psnr=30.0)
-    plan = tile_plan(replace(coarse, plan=watched, steps=70), free=500, parts=WHOLE)
+    plan = tile_plan(replace(coarse, plan=watched, steps=70), free=500, photos=9)
     assert (plan.validation, plan.stops_when_flat, plan.target_psnr) == (None, False, None)
     assert plan.schedule.budget.steps == plan.schedule.expected_steps == 56
 

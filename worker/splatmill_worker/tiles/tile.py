@@ -7,7 +7,7 @@ that were trained around it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
@@ -38,7 +38,7 @@ from splatmill_worker.splat.train.loop import Hooks, train
 from splatmill_worker.splat.train.observers import TrainingProgress
 from splatmill_worker.splat.views import TrainingView
 from splatmill_worker.tiles.coarse_model import Coarse
-from splatmill_worker.tiles.visibility import Enlarged, Part, parts
+from splatmill_worker.tiles.visibility import Part, parts
 
 MARGIN = 0.05
 """Width of what is trained around a cell and then left to the tiles beside it, over the longest side of the box that
@@ -93,13 +93,12 @@ def train_tile(tile: Tile, stages: Stages) -> TileResult:
     core = torch.from_numpy(cell.holds(means))
     free = torch.from_numpy(cell.holds(means, _margin(coarse.gaussians)))
     with stages.measured("load"):
-        shown = list(_views(tile, whole, core))
-        views = [view for view, _ in shown]
+        views = list(_views(tile, whole, core))
         memory.return_freed()
     within = whole.select(core)
     if not views or not within.count:
         return TileResult(within, {"gaussians": within.count, "steps": 0, "photos": len(views)})
-    plan = tile_plan(coarse, int(free.sum()), [enlarged for _, enlarged in shown], last=tile.last)
+    plan = tile_plan(coarse, int(free.sum()), len(views), last=tile.last)
     photo_bytes = BYTES_PER_PIXEL * sum(view.full.camera.width * view.full.camera.height for view in views)
     engine = open_engine(
         whole.select(free),
@@ -154,15 +153,15 @@ def _some(rows: Tensor, limit: int = 100_000) -> Tensor:
     return rows[:: max(1, math.ceil(len(rows) / limit))]
 
 
-def tile_plan(coarse: Coarse, free: int, parts: Sequence[Enlarged], *, last: bool = False) -> Plan:
-    """The plan of a tile of `free` Gaussians that these parts of photos show: that of the coarse one, from a model on.
+def tile_plan(coarse: Coarse, free: int, photos: int, *, last: bool = False) -> Plan:
+    """The plan of a tile of `free` Gaussians that so many photos show: that of the coarse model, from a model on.
 
     last: of its last steps, in which no Gaussians are added.
 
     All its steps are as many as the coarse training took, but at least two. It sets no photo aside: the coarse model
     has been trained on all of them, so that they could judge no more.
     """
-    plan, schedule, photos = coarse.plan, coarse.plan.schedule, len(parts)
+    plan, schedule = coarse.plan, coarse.plan.schedule
     until, boost = 1.0 - LAST, schedule.annealing.boost
     first = max(1, min(coarse.steps - 1, round(until * coarse.steps)))
     steps = max(1, coarse.steps - first) if last else first
@@ -195,14 +194,12 @@ def tile_plan(coarse: Coarse, free: int, parts: Sequence[Enlarged], *, last: boo
             resolution=((0, 1),),
             densify_until=min(1.0, schedule.densify_until / until),
             annealing=annealing,
-            score_scale=sum(part.score for part in parts) / photos,
-            extent_scale=max(part.extent for part in parts),
             earlier_visits=coarse.steps / max(1, len(coarse.viewmats)) + (first / photos if last else 0.0),
         ),
     )
 
 
-def _views(tile: Tile, whole: Gaussians, members: Tensor) -> Iterator[tuple[TrainingView, Enlarged]]:
+def _views(tile: Tile, whole: Gaussians, members: Tensor) -> Iterator[TrainingView]:
     """The parts of the training photos that show the members, bool [N], of the scene `whole`, in files where memory is
     too small for them.
     """
@@ -228,9 +225,7 @@ def _views(tile: Tile, whole: Gaussians, members: Tensor) -> Iterator[tuple[Trai
     divided_photos.forget()
 
 
-def _part_of(
-    tile: Tile, view: View, part: Part, size: int, files: PixelFiles | None
-) -> tuple[TrainingView, Enlarged]:
+def _part_of(tile: Tile, view: View, part: Part, size: int, files: PixelFiles | None) -> TrainingView:
     """The part of one photo, in the light and with the camera of the coarse training."""
     photo = load_view(view, size)
     whole = TrainingView.of(photo, tile.cameras.normalization)
@@ -240,4 +235,4 @@ def _part_of(
     camera = tile.coarse.corrected(view.name, target.camera)
     viewmat = torch.as_tensor(camera.viewmat, dtype=torch.float32)
     shown = part.of(replace(whole, levels={1: target._replace(camera=camera, viewmat=viewmat)}))
-    return shown if files is None else shown.placed(files), Enlarged.of(target, shown.full)
+    return shown if files is None else shown.placed(files)

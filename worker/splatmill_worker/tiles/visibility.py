@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -64,30 +63,6 @@ class Part:
             self.counted if full.mask is None else self.counted & full.mask[rows, columns],
         )
         return TrainingView(view.name, {1: target})
-
-
-@dataclass(frozen=True)
-class Enlarged:
-    """How much larger a part of a photo makes what is measured over a photo (decisions: seams).
-
-    score: the gradient of a mean over the pixels that count, with respect to a place in halves of the photo's sides.
-    extent: the size of a Gaussian in halves of the photo's longer side.
-    """
-
-    score: float
-    extent: float
-
-    @staticmethod
-    def of(whole: Target, part: Target) -> Enlarged:
-        """What the part of a photo does to the measures of the whole."""
-        before, after = whole.rgb.shape[:2], part.rgb.shape[:2]
-        sides = math.sqrt(math.prod(after) / math.prod(before))
-        return Enlarged(sides * _used(whole) / max(1, _used(part)), max(before) / max(after))
-
-
-def _used(target: Target) -> int:
-    """Number of pixels that count."""
-    return math.prod(target.rgb.shape[:2]) if target.mask is None else int(target.mask.sum())
 
 
 def parts(

@@ -15,7 +15,7 @@ from torch import Tensor
 from splatmill_worker.kernels.reference.project import rotation
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.train.density import prune
-from splatmill_worker.splat.train.density.densify import THRESHOLD, Change, densify, halves, scaled
+from splatmill_worker.splat.train.density.densify import Change, densify, halves, scaled
 
 
 def gaussians(n: int, scale: float = 0.05, opacity: float = 0.5) -> Gaussians:
@@ -130,18 +130,6 @@ def test_what_cannot_be_seen_goes() -> None:
     extent = torch.tensor([0.0, 0.0, 0.0, 9.0, 0.0, math.nan])
     assert prune.keep(scene, extent).tolist() == [False, False, False, False, True, False]
     assert prune.keep(scene, None).tolist() == [False, False, False, True, True, True]
-
-
-def test_scores_and_extents_of_parts_of_photos_are_brought_to_those_of_whole_ones() -> None:
-    scores = torch.tensor([3.0, 3.0, 1.5, 3.0]) * THRESHOLD
-    engine = Held(gaussians(4), scores)
-    engine.max_extent[3] = 2.0 * prune.MAX_SCREEN
-    change = densify(engine, allowed=9, score_scale=2.0, extent_scale=2.1)  # type: ignore[arg-type]  # as above
-    assert (change.added, change.removed) == (3, 0)
-    engine = Held(gaussians(4), scores)
-    engine.max_extent[3] = 2.0 * prune.MAX_SCREEN
-    change = densify(engine, allowed=9)  # type: ignore[arg-type]  # as above
-    assert (change.added, change.removed) == (3, 1)
 
 
 def test_decayed_opacities_are_multiplied() -> None:

@@ -45,9 +45,6 @@ class Schedule:
     earlier_visits: steps on each photo before the first of this run, for `dropout`: a tile starts from a model that has
         been trained on them.
     ends_at: steps after which few photos from one side end the run, whatever its budget; None where they do not.
-    score_scale: how much larger the gradients are by which Gaussians are split than on whole photos: on a part of a
-        photo, the loss is a mean over fewer pixels.
-    extent_scale: how much larger, at most, a Gaussian is over a part of a photo than over the whole.
     """
 
     budget: Budget
@@ -66,8 +63,6 @@ class Schedule:
     in_view: float = 1.0
     position_scale: float = 1.0
     earlier_visits: float = 0.0
-    score_scale: float = 1.0
-    extent_scale: float = 1.0
 
     def seen_by(self, photos: float) -> Schedule:
         """The schedule for a part of the scene that this share of the photos shows, above 0, trained on these alone."""

@@ -303,8 +303,6 @@ class TrainingRun:
                 allowed=allowed,
                 opacity_decay=self.plan.schedule.opacity_decay,
                 decay_within=math.inf if within is None else within,
-                score_scale=self.plan.schedule.score_scale,
-                extent_scale=self.plan.schedule.extent_scale,
             )
         except MemoryError as short:
             raise TrainingFailed(FailureName.memory, f"{short}", step=self.state.step) from short

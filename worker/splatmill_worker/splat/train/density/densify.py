@@ -43,20 +43,17 @@ def densify(
     allowed: int,
     opacity_decay: float = 1.0,
     decay_within: float = math.inf,
-    score_scale: float = 1.0,
-    extent_scale: float = 1.0,
 ) -> Change:
     """Prune, then split the Gaussians whose mean gradient is above THRESHOLD.
 
     allowed: most Gaussians afterwards; those with the largest mean gradient are split first.
     opacity_decay: factor on the opacities of the Gaussians that stay as they are.
     decay_within: distance from the origin, in the training world, up to which opacities decay.
-    score_scale, extent_scale: what gradients and extents are divided by, as in `Schedule`.
     """
     before = engine.count
-    score = engine.plain_sum / engine.visible_count.clamp_min(1) / score_scale
+    score = engine.plain_sum / engine.visible_count.clamp_min(1)
     rows = Rows.of(engine)
-    kept = prune.keep(rows.gaussians, engine.max_extent / extent_scale)
+    kept = prune.keep(rows.gaussians, engine.max_extent)
     split = largest(kept & (score > THRESHOLD), score, allowed - int(kept.sum()))
     new = halves(rows.gaussians.select(split))
     rows = rows.keep(kept & ~split)
