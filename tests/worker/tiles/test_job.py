@@ -7,6 +7,7 @@ Does not prove that others find the tiles: tests/service/test_tiles.py does.
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -189,3 +190,16 @@ def test_a_job_whose_coarse_model_is_there_is_in_training(tmp_path: Path) -> Non
     run(tmp_path, others, lambda events: "coarse" in others.stores)
     outcome, events = run(tmp_path, Play())
     assert (outcome.ended, states(events)) == ("succeeded", [JobState.training, JobState.exporting])
+
+
+def test_given_cameras_with_points_leave_nothing_that_was_recovered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def without(context: Context) -> None:
+        run_unit(context)
+        if context.run.name == "cameras":
+            shutil.rmtree(context.run.path / "sfm")  # the points, which these photos had to give
+
+    monkeypatch.setattr(job, "run_unit", without)
+    outcome, _ = run(tmp_path, Play())
+    assert outcome.ended == "succeeded"

@@ -190,8 +190,8 @@ def _do(work: _Work, name: str) -> None:
     return_freed()
     if name != "scene":
         work.others.stored(run.path)
-    if name == "cameras":
-        # Where the service looks for cameras that other jobs on the capture can use.
+    if name == "cameras" and (run.path / SFM).is_dir():
+        # Where the service looks for cameras that other jobs on the capture can use; given ones have none.
         shutil.copytree(run.path / SFM, work.workdir / SFM, copy_function=_link, dirs_exist_ok=True)
     elif name == "coarse":
         shutil.rmtree(work.workdir / CHECKPOINTS, ignore_errors=True)
