@@ -224,9 +224,10 @@ def test_failures_that_followed_from_failures_are_forgotten_with_them(shared: Pl
     assert shared.plan.ready(shared.states()) == ["seam-1", "seam-2"]
 
 
-def test_the_states_of_many_tiles_take_little_time(tmp_path: Path) -> None:
+def test_a_plan_of_the_most_tiles_makes_its_units_once_and_has_its_states(tmp_path: Path) -> None:
     options = TrainOptions.model_validate({"tiles": 1024})
     many = PlanFolder(tmp_path, ScenePlan("d", options))
+    assert many.plan.units is many.plan.units
     for name in ("cameras", "coarse", *many.plan.tile_names[:-1]):
         path = many.root / "units" / f"{name}-{many.plan.key(name, {})}"
         path.mkdir(parents=True)
