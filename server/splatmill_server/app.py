@@ -18,7 +18,7 @@ from splatmill_server.access.cors import pages_of_others
 from splatmill_server.access.exposure import check_exposure, unbounded_trust
 from splatmill_server.access.permission import PERMITTED, is_open
 from splatmill_server.access.sessions import COOKIE
-from splatmill_server.base import problems, root_path
+from splatmill_server.base import cancelling, problems, root_path
 from splatmill_server.base.proxies import TrustedProxies
 from splatmill_server.base.settings import Settings
 from splatmill_server.middleware import RequestMiddleware
@@ -83,9 +83,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             yield
         finally:
             service.closing.set()
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
+            await cancelling.end(*tasks)
             # The process ends with its threads, and a sweep, or lists that are made, may go through all of storage.
             end = threading.Timer(_STOP_SECONDS, service.storage.close)
             end.daemon = True

@@ -53,7 +53,7 @@ def connect(url: str = DEFAULT_URL, *, timeout: float | None = None, retries: in
 
 
 def connect_async(url: str = DEFAULT_URL) -> redis.asyncio.Redis:
-    """Return an asyncio client for reading streams. It has no timeout, because `XREAD BLOCK` waits by design.
+    """Return an asyncio client for reading streams. It has no timeout: `XREAD BLOCK` and `BRPOP` wait by design.
 
     It opens at most ASYNC_CONNECTIONS; a command waits for a free one.
 
@@ -64,6 +64,7 @@ def connect_async(url: str = DEFAULT_URL) -> redis.asyncio.Redis:
             url,
             max_connections=ASYNC_CONNECTIONS,
             timeout=_FREE_SECONDS,
+            socket_timeout=None,
             health_check_interval=15,
             retry=AsyncRetry(ExponentialBackoff(cap=2, base=0.1), 1),
             **_connect_timeout(url),

@@ -24,6 +24,7 @@ from splatmill.backplane.storage.storage import StorageError
 from splatmill.schema import DeliveryAttempt, DeliveryState, format_duration
 from splatmill.schema.headers import read_retry_after
 from splatmill.sdk.webhook_signature import sign
+from splatmill_server.base import cancelling
 from splatmill_server.base.leases import lease
 from splatmill_server.base.metrics import Metrics
 from splatmill_server.base.outgoing import Outgoing, OutgoingError
@@ -122,10 +123,7 @@ class Deliveries:
                     async with asyncio.timeout(pause):
                         await self._wake.wait()
         finally:
-            tasks = list(self._running.values())
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
+            await cancelling.end(*self._running.values())
 
     async def _look(self) -> None:
         self._due_at = float("inf")

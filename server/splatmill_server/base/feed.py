@@ -22,6 +22,7 @@ from redis.asyncio import Redis as AsyncRedis
 from splatmill.backplane import keys
 from splatmill.backplane.jobs import events
 from splatmill.backplane.jobs.events import START, StoredEvent, stream_order
+from splatmill_server.base import cancelling
 
 log = structlog.get_logger()
 
@@ -140,8 +141,7 @@ class Feed:
     async def stop(self) -> None:
         """End the reader."""
         if (reading := self._reading) is not None:
-            reading.cancel()
-            await asyncio.gather(reading, return_exceptions=True)
+            await cancelling.end(reading)
 
     async def catch_up(self, subscription: Subscription, entries: Sequence[str]) -> tuple[Batch, bool]:
         """Read all events of a job after these entries. Return them, and whether those that follow come by the feed.

@@ -11,6 +11,7 @@ from redis.lock import Lock
 from starlette.concurrency import run_in_threadpool
 
 from splatmill.backplane import expiry, keys
+from splatmill_server.base import cancelling
 
 SECONDS = 30
 """Seconds until the lease of a process that was killed expires."""
@@ -40,14 +41,14 @@ async def lease(connection: redis.Redis, kind: str, name: str) -> AsyncIterator[
     try:
         yield True
     finally:
-        renewal.cancel()
-        with suppress(asyncio.CancelledError):
-            await renewal
-        with suppress(redis.RedisError):
-            # Shielded: a second cancellation, as while the server stops, must not keep the lease for SECONDS.
-            await asyncio.shield(
-                asyncio.ensure_future(run_in_threadpool(connection.eval, _RELEASE, 1, key, token))
-            )
+        try:
+            with suppress(redis.RedisError):
+                # Shielded: a second cancellation, as while the server stops, must not keep the lease for SECONDS.
+                await asyncio.shield(
+                    asyncio.ensure_future(run_in_threadpool(connection.eval, _RELEASE, 1, key, token))
+                )
+        finally:
+            await cancelling.end(renewal)
 
 
 @contextmanager

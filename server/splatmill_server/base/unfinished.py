@@ -15,6 +15,7 @@ from starlette.concurrency import run_in_threadpool
 
 from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.storage import Storage, StorageError
+from splatmill_server.base import cancelling
 from splatmill_server.base.leases import keep_for, lease
 from splatmill_server.base.turns import Turns
 
@@ -109,10 +110,7 @@ class Unfinished:
                     async with asyncio.timeout(self._look_seconds):
                         await self._wake.wait()
         finally:
-            tasks = list(self.running.values())
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
+            await cancelling.end(*self.running.values())
 
     async def _take_up(self) -> None:
         """Begin as many pieces as may run at once, of each line those that were asked for first."""
@@ -166,6 +164,5 @@ class Unfinished:
                         task.cancel()
         finally:
             self._working.pop(name, None)
-            task.cancel()
-            await asyncio.wait({task})
+            await cancelling.end(task)
         return await self._work(name) if task.cancelled() else task.result()

@@ -12,6 +12,7 @@ from starlette.responses import Response, StreamingResponse
 from splatmill.backplane import rendering
 from splatmill.schema.headers import read_token
 from splatmill_server.access.caller import Caller
+from splatmill_server.base import cancelling
 from splatmill_server.base.renderer import post
 
 _PASSED_BACK = (
@@ -85,11 +86,7 @@ async def while_connected(request: Request, pending: Coroutine[Any, Any, T]) -> 
         await asyncio.wait({work, gone}, return_when=asyncio.FIRST_COMPLETED)
         return await work if work.done() else None
     finally:
-        unfinished = [task for task in (work, gone) if not task.done()]
-        for task in unfinished:
-            task.cancel()
-        if unfinished:
-            await asyncio.wait(unfinished)
+        await cancelling.end(work, gone)
 
 
 async def _disconnect(request: Request) -> None:

@@ -21,6 +21,7 @@ from splatmill.backplane.jobs.fold import Fold
 from splatmill.backplane.jobs.row import JobRow
 from splatmill.backplane.storage.records import UnreadableRecord, warn
 from splatmill.schema import EventRecord, Job, JobState, StateEvent, Time
+from splatmill_server.base import cancelling
 from splatmill_server.base.feed import Batch, Row, is_beyond
 from splatmill_server.service import Service
 
@@ -197,8 +198,7 @@ async def event_stream(follower: Follower, heartbeat: float, open_streams: Gauge
     finally:
         open_streams.dec()
         if pending is not None:
-            pending.cancel()
-            await asyncio.wait({pending})
+            await cancelling.end(pending)
 
 
 def encode(record: EventRecord) -> bytes:

@@ -4,18 +4,20 @@ In these tests the reaper and the loop of deliveries look once an hour, so that 
 here: what a delivery holds, and how it is repeated (tests/server/test_webhooks).
 """
 
+import asyncio
 from datetime import datetime
-from typing import Any
+from typing import Any, cast
 
 import pytest
 import redis
 
 from splatmill import verify_webhook
 from splatmill.backplane import keys
+from splatmill.backplane.connection import connect_async
 from splatmill.backplane.jobs import events, row
 from splatmill.backplane.queue import leases
 from splatmill.schema import JobState, LogEvent, Problem, ProgressEvent, StateEvent, TrainOptions
-from splatmill_server.background import deliveries
+from splatmill_server.background import deliveries, ends
 from splatmill_server.jobs.records import Jobs
 from tests.support.served_app import Serve, ServedApp
 from tests.support.servers.queue_entries import take
@@ -37,6 +39,17 @@ def webhook(app: ServedApp, peer: ScriptedServer) -> Any:
 
 def log_of(app: ServedApp, made: Any) -> Any:
     return app.http.get(f"/v1/webhooks/{made['id']}/deliveries").json()["deliveries"]
+
+
+def test_a_redis_without_ends_is_not_taken_for_one_that_does_not_answer(redis_url: str) -> None:
+    async def waited() -> object:
+        client = connect_async(redis_url)
+        try:
+            return await cast(Any, client.brpop([keys.ENDS], timeout=ends._WAIT))
+        finally:
+            await client.aclose()
+
+    assert asyncio.run(waited()) is None
 
 
 @pytest.mark.parametrize("state", ["succeeded", "failed", "cancelled"])

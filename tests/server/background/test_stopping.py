@@ -1,7 +1,7 @@
 """The loops of the server end when they are cancelled, also in the moment in which they are woken.
 
 `asyncio.wait_for` of Python 3.11 returns instead of raising where a wait ends as it is cancelled, and a server with
-such a loop never stopped.
+such a loop never stopped. The client of Redis uses it where its sockets have a timeout.
 """
 
 import asyncio
@@ -39,5 +39,20 @@ def test_a_loop_that_is_woken_as_it_is_cancelled_ends(tmp_path: Path, redis_url:
             assert not pending, turns
             assert loop.cancelled()
         await service.close()
+
+    asyncio.run(ends())
+
+
+def test_the_loop_that_waits_for_redis_ends_whenever_it_is_cancelled(tmp_path: Path, redis_url: str) -> None:
+    async def ends() -> None:
+        for turns in range(1, 60, 2):
+            service = Service.of(Settings(redis_url=redis_url, data=tmp_path))
+            loop = asyncio.ensure_future(service.ends.run())
+            for _ in range(turns):
+                await asyncio.sleep(0)  # it connects, sends its request, or waits
+            loop.cancel()
+            _, pending = await asyncio.wait({loop}, timeout=5)
+            assert not pending, turns
+            await service.close()
 
     asyncio.run(ends())

@@ -1,0 +1,49 @@
+"""Tasks end, also those that have lost a cancellation."""
+
+import asyncio
+
+import pytest
+
+from splatmill_server.base import cancelling
+
+
+def test_a_task_that_lost_a_cancellation_is_cancelled_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cancelling, "_AGAIN_SECONDS", 0.05)
+    lost = 0
+
+    async def loop() -> None:
+        nonlocal lost
+        while True:
+            try:
+                await asyncio.sleep(60)
+            except asyncio.CancelledError:
+                lost += 1
+                if lost == 3:
+                    raise
+
+    async def ended() -> tuple[bool, bool]:
+        one, done = asyncio.create_task(loop()), asyncio.create_task(asyncio.sleep(0))
+        await asyncio.sleep(0.01)
+        async with asyncio.timeout(10):
+            await cancelling.end(one, done)
+        return one.cancelled(), done.done()
+
+    assert asyncio.run(ended()) == (True, True)
+    assert lost == 3
+
+
+def test_what_a_task_raises_at_its_end_is_dropped(caplog: pytest.LogCaptureFixture) -> None:
+    async def fails() -> None:
+        try:
+            await asyncio.sleep(60)
+        finally:
+            raise RuntimeError("while it ended")
+
+    async def ended() -> bool:
+        task = asyncio.create_task(fails())
+        await asyncio.sleep(0)
+        await cancelling.end(task)
+        return task.done()
+
+    assert asyncio.run(ended())
+    assert "never retrieved" not in caplog.text
