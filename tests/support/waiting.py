@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable
 from typing import Literal, TypeVar
 
-from splatmill.backplane.process import start_time
+from splatmill.process import start_time
 
 Value = TypeVar("Value")
 

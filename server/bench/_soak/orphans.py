@@ -9,7 +9,7 @@ from pathlib import Path
 
 import psutil
 
-from splatmill.backplane.process import start_time
+from splatmill.process import start_time
 
 _PR_SET_CHILD_SUBREAPER = 36
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import psutil
 
-from splatmill.backplane.process import start_time
+from splatmill.process import start_time
 
 SUPERVISOR, WORKER, TRAINER = "supervisor", "worker", "trainer"
 

@@ -23,10 +23,10 @@ from _soak.orphans import Adoption
 from _soak.processes import Member, Processes
 from _soak.proxy import Proxy
 from splatmill.backplane.connection import connect
-from splatmill.backplane.process import die_with_parent, start_time
 from splatmill.backplane.queue import entries, leases
 from splatmill.backplane.redis_program import find
 from splatmill.backplane.storage.storage import Storage
+from splatmill.process import die_with_parent, start_time
 
 DISK_BYTES = 640 << 20
 """Size of the disk of the data folder, so that it can be filled: some 300 jobs leave a megabyte each."""

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 
-from splatmill.backplane.process import die_with_parent
+from splatmill.process import die_with_parent
 
 _FIRST_PAUSE = 0.1  # seconds
 _LONGEST_PAUSE = 10.0  # seconds

@@ -9,7 +9,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from splatmill.backplane.process import start_time
+from splatmill.process import start_time
 
 _SOCKET_LIMIT = 100  # sun_path holds 108 bytes on Linux, 104 on macOS
 _LOG_BYTES = 10 << 20  # a larger log is renamed when its process starts

@@ -30,10 +30,10 @@ from _soak.proxy import Proxy
 
 from splatmill.backplane import keys, lists
 from splatmill.backplane.jobs import events
-from splatmill.backplane.process import start_time
 from splatmill.backplane.queue import entries, queue, rq_keys
 from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.storage import Storage
+from splatmill.process import start_time
 from splatmill.schema import JobState, Problem, StateEvent
 from tests.support.served_app import Serve, ServedApp
 from tests.support.waiting import wait_for

@@ -21,7 +21,7 @@ from _soak.orphans import Adoption
 from _soak.processes import Member, Processes, role_of
 from _soak.target import Target
 
-from splatmill.backplane.process import start_time
+from splatmill.process import start_time
 from tests.support.waiting import wait_for
 
 PYTHON = "/usr/bin/python3.11"

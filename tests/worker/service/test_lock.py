@@ -11,7 +11,7 @@ from dataclasses import replace
 import redis
 
 from splatmill.backplane import keys
-from splatmill.backplane.process import ProcessIdentity, start_time
+from splatmill.process import ProcessIdentity, start_time
 from splatmill_worker.service.lock import STALE_MS, JobLock, LockState
 from tests.support.waiting import wait_for
 

@@ -9,14 +9,17 @@ import os
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from splatmill.process import ProcessIdentity
 from splatmill.schema import TrainOptions
 from splatmill_worker.errors import Refusal
 from splatmill_worker.tiles.folder import CLAIM_SECONDS, Claimed, PlanFolder, digest_of
 from splatmill_worker.tiles.units import ScenePlan
+from tests.support.waiting import gone, wait_for
 
 
 @pytest.fixture
@@ -72,21 +75,23 @@ def test_a_claim_of_a_killed_process_of_this_machine_is_free_at_once(shared: Pla
         "with PlanFolder.open(Path(sys.argv[1])).claimed('cameras') as run:\n"
         "    (run.work / 'half').write_text('x'); os.kill(os.getpid(), 9)"
     )
-    killed = subprocess.run([sys.executable, "-c", code, str(shared.root)], check=False)
+    with subprocess.Popen([sys.executable, "-c", code, str(shared.root)]) as killed:
+        wait_for(lambda: gone([killed.pid]))  # its parent has not read its status yet
+        assert claim_of(shared).exists()
+        assert shared.running("cameras") is None
+        do(shared, "cameras")
     assert killed.returncode == -9
-    assert claim_of(shared).exists()
-    assert shared.running("cameras") is None
-    do(shared, "cameras")
     assert len(list((shared.root / "units").iterdir())) == 1
 
 
 def test_a_claim_of_another_machine_holds_while_it_is_renewed(shared: PlanFolder) -> None:
     (shared.root / "units").mkdir()
     claim = shared.root / "units" / f"cameras-{shared.plan.key('cameras', {})}.claim"
-    claim.write_text(json.dumps({"token": "t", "host": "elsewhere", "machine": "m", "pid": 1, "started": 0}))
+    process = replace(ProcessIdentity.of(os.getpid()), machine="m", started="0")
+    claim.write_text(json.dumps({"token": "t", "host": "elsewhere", **process.dump()}))
     with pytest.raises(Claimed):
         do(shared, "cameras")
-    assert shared.running("cameras") == "elsewhere, process 1"
+    assert shared.running("cameras") == f"elsewhere, process {os.getpid()}"
     make_old(claim)
     assert shared.running("cameras") is None
     do(shared, "cameras")

@@ -14,9 +14,9 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from splatmill.backplane.process import die_with_parent
 from splatmill.backplane.rendering import MeshLine
 from splatmill.backplane.storage.records import reason
+from splatmill.process import die_with_parent
 from splatmill.schema import Box, MeshFacts, ModelCameras, OrbitRequest, Progress
 from splatmill_worker.errors import ModelUnreadable, Refusal
 from splatmill_worker.kernels import ops

@@ -16,8 +16,8 @@ from typing import Any, cast
 import redis
 
 from splatmill.backplane import keys
-from splatmill.backplane.process import ProcessIdentity
 from splatmill.backplane.queue.entries import HEARTBEAT_SLACK, MONITORING_INTERVAL
+from splatmill.process import ProcessIdentity
 
 STALE_MS = (MONITORING_INTERVAL + HEARTBEAT_SLACK) * 1000
 """Age in milliseconds of the last heartbeat at which a holder on another machine counts as dead, as it does for RQ."""

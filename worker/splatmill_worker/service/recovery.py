@@ -17,10 +17,10 @@ from rq.executions import Execution
 from rq.worker_registration import get_keys
 
 from splatmill.backplane import keys
-from splatmill.backplane.process import ProcessIdentity, wait_gone
 from splatmill.backplane.queue import leases, lines, rq_keys
 from splatmill.backplane.queue.entries import split_rq_id, tile_of
 from splatmill.backplane.queue.leases import Lease
+from splatmill.process import ProcessIdentity, wait_gone
 from splatmill_worker.service.attempts.attempt import Attempt
 from splatmill_worker.service.lock import Holder, JobLock
 

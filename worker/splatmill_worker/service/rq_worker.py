@@ -30,10 +30,10 @@ from rq.worker_registration import clean_worker_registry, register
 
 from splatmill.backplane import keys, log_lines, totals
 from splatmill.backplane.jobs.row import request_of
-from splatmill.backplane.process import die_with_parent
 from splatmill.backplane.queue import entries, leases, lines, workers
 from splatmill.backplane.queue.leases import Lease, Reclaim
 from splatmill.backplane.queue.lines import Line
+from splatmill.process import die_with_parent
 from splatmill_worker.service import hand_back, recovery
 from splatmill_worker.service.abandoned_folders import remove_abandoned, tidy
 from splatmill_worker.service.attempt_limits import Exceeded, Limits, LimitWatch, RunTimeExceeded, die_first

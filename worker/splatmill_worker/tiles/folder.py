@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from splatmill.files import atomic_write
+from splatmill.process import ProcessIdentity
 from splatmill_worker.errors import Refusal
 from splatmill_worker.tiles.units import ScenePlan, State
 
@@ -189,7 +190,8 @@ class PlanFolder:
 
     def _take(self, claim: Path, token: str) -> None:
         """Write the claim. Raises Claimed where there is one that is still renewed."""
-        text = json.dumps({"token": token, **_process()})
+        process = ProcessIdentity.of(os.getpid()).dump()
+        text = json.dumps({"token": token, "host": socket.gethostname(), **process})
         own = claim.with_name(f"{claim.name}.{token}")
         own.write_text(text, "utf-8")
         try:
@@ -311,39 +313,12 @@ def _read(path: Path) -> dict[str, Any] | None:
     return document if isinstance(document, dict) else None
 
 
-def _process() -> dict[str, Any]:
-    """This process, so that others on the same machine see whether it still runs."""
-    return {
-        "host": socket.gethostname(),
-        "pid": os.getpid(),
-        "machine": _machine(),
-        "started": _started(os.getpid()),
-    }
-
-
-def _machine() -> str | None:
-    """What names the running system and its view of processes, on Linux; None elsewhere."""
-    try:
-        boot = Path("/proc/sys/kernel/random/boot_id").read_text("ascii").strip()
-        return f"{boot} {os.readlink('/proc/self/ns/pid')}"
-    except OSError:
-        return None
-
-
-def _started(pid: int) -> int | None:
-    """When a process began, in ticks since the system did, which no setting of a clock changes; None without it."""
-    try:
-        return int(Path(f"/proc/{pid}/stat").read_text("utf-8").rpartition(")")[2].split()[19])
-    except (OSError, ValueError, IndexError):
-        return None
-
-
 def _has_ended(claim: Path) -> bool:
     """Whether the process of a claim was one of this machine and runs no more; False where that cannot be seen."""
-    theirs, machine = _read(claim) or {}, _machine()
-    if machine is None or theirs.get("machine") != machine or not isinstance(theirs.get("pid"), int):
+    try:
+        return ProcessIdentity.load(_read(claim) or {}).dead()
+    except (KeyError, TypeError, ValueError):
         return False
-    return _started(theirs["pid"]) != theirs.get("started")
 
 
 def _token(claim: Path) -> str | None:

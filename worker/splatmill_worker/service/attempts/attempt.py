@@ -8,8 +8,8 @@ import redis
 
 from splatmill.backplane import keys
 from splatmill.backplane.jobs import events
-from splatmill.backplane.process import ProcessIdentity
 from splatmill.backplane.queue.entries import split_rq_id
+from splatmill.process import ProcessIdentity
 from splatmill.schema import Event, JobState, LogEvent, Problem, StateEvent
 from splatmill_worker.service import hand_back
 from splatmill_worker.service.lock import JobLock

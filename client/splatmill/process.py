@@ -1,6 +1,7 @@
 """Processes that end with their parent, and a reliable test whether a process has ended.
 
 Together they ensure that no attempt at a job runs unnoticed, and that none begins while an earlier one may still run.
+A unit of a scene in tiles whose process was killed is free at once by the same test.
 """
 
 import ctypes
