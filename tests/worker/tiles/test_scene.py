@@ -17,14 +17,16 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
 from splatmill.schema import Backend, ModelCameras, Report, TrainOptions
 from splatmill_worker import pipeline
 from splatmill_worker.kernels.gpu.device import absence
 from splatmill_worker.splat.formats import registry
+from splatmill_worker.splat.gaussians import concatenate
 from splatmill_worker.splat.plan.rates import RateSchedule, boost_of
-from splatmill_worker.tiles import coarse_model, command
-from splatmill_worker.tiles.folder import PlanFolder
+from splatmill_worker.tiles import coarse_model, command, joined
+from splatmill_worker.tiles.folder import PlanFolder, facts_of
 from splatmill_worker.tiles.tile import tile_plan
 from tests.support import still_life
 from tests.support.made_once import made_once
@@ -110,24 +112,28 @@ def test_a_tile_goes_on_where_the_coarse_model_stopped(whole: Path) -> None:
     path = PlanFolder.open(whole).ended()["coarse"].path
     assert path is not None
     coarse = coarse_model.read(path)
-    plan = tile_plan(coarse, free=500, photos=9)
+    plan = tile_plan(coarse, free=500, photos=11)
     assert coarse.steps == 100
     assert plan.schedule.earlier_visits == coarse.steps / len(coarse.viewmats)
     assert plan.schedule.reduced_until == 0
     assert plan.max_gaussians == pytest.approx(3000 * 500 / coarse.gaussians.count, abs=1)
-    last = tile_plan(coarse, free=500, photos=9, last=True)
+    last = tile_plan(coarse, free=500, photos=11, last=True)
     assert (plan.schedule.budget.steps, last.schedule.budget.steps) == (80, 20)
     assert (last.densify, last.max_gaussians) == (False, 500)
-    assert last.schedule.earlier_visits == coarse.steps / len(coarse.viewmats) + 80 / 9
+    assert last.schedule.earlier_visits == coarse.steps / len(coarse.viewmats) + 80 / 11
     first_ends, last_begins = (
         RateSchedule(1.0, each.schedule.annealing).at(progress)
         for each, progress in ((plan, 1.0), (last, 0.0))
     )
     assert first_ends == last_begins
     doubled = replace(coarse, steps=4000)  # the course of a run that was laid out for fewer steps
-    for part in (tile_plan(doubled, 500, 9, last=last).schedule for last in (False, True)):
+    for part in (tile_plan(doubled, 500, 11, last=last).schedule for last in (False, True)):
         assert part.budget.steps is not None
         assert part.annealing.boost == boost_of(4000) < boost_of(part.budget.steps)
+    photos = len(coarse.viewmats)
+    each = round(4000 * (photos // 3) / photos)
+    third = [tile_plan(doubled, 500, photos // 3, last=last).schedule.budget.steps for last in (False, True)]
+    assert third == [round(0.8 * each), each - round(0.8 * each)], "as often on each photo"
     late = replace(plan.schedule, dropout=0.2, earlier_visits=150.0)
     assert late.left_out(0.0) == pytest.approx(0.1)
     assert late.left_out(50.0) == pytest.approx(0.2)
@@ -138,9 +144,39 @@ def test_a_tile_sets_no_photo_aside_that_the_coarse_model_was_trained_on(whole: 
     assert path is not None
     coarse = coarse_model.read(path)
     watched = replace(coarse.plan, validation=2, stops_when_flat=True, target_psnr=30.0)
-    plan = tile_plan(replace(coarse, plan=watched, steps=70), free=500, photos=9)
+    plan = tile_plan(replace(coarse, plan=watched, steps=70), free=500, photos=11)
     assert (plan.validation, plan.stops_when_flat, plan.target_psnr) == (None, False, None)
     assert plan.schedule.budget.steps == plan.schedule.expected_steps == 56
+
+
+def test_no_tile_trains_what_stands_far_behind_a_large_scene(whole: Path, tmp_path: Path) -> None:
+    root = copied(whole, tmp_path / "plan", ("tile-1", "tile-2"))
+    path = PlanFolder.open(root).ended()["coarse"].path
+    assert path is not None
+    coarse = coarse_model.read(path)
+    assert not coarse.far.any(), "a photo has half of the scene in view"
+    shell = coarse.gaussians.select(torch.arange(coarse.gaussians.count) < 20)
+    shell = replace(shell, means=shell.means + 1000.0)
+    schedule = replace(coarse.plan.schedule, in_view=0.2)
+    large = replace(
+        coarse,
+        gaussians=concatenate(coarse.gaussians, shell),
+        plan=replace(coarse.plan, schedule=schedule),
+    )
+    far = int(large.far.sum())
+    assert large.far[-20:].all()
+    assert far < large.gaussians.count / 2
+    large.write(path)
+    done("splatmill", "unit", str(root))
+    ended = PlanFolder.open(root).ended()
+    outputs = {name: end.path for name, end in ended.items() if end.path is not None}
+    trained = [facts_of(outputs[f"seam-{number}"])["gaussians"] for number in (1, 2)]
+    assert facts_of(outputs["scene"])["gaussians"] == sum(trained) + far
+    whole_scene = joined.joined(large, [outputs["seam-1"], outputs["seam-2"]])
+    left = large.gaussians.select(large.far)
+    for name, values in left.parameters().items():
+        assert torch.equal(whole_scene.parameters()[name][-far:], values)
+    assert joined.joined(large, [None, None]).count == large.gaussians.count
 
 
 def test_the_scene_has_the_files_of_a_training(whole: Path) -> None:

@@ -95,15 +95,18 @@ class Joining:
 
 
 def joined(coarse: Coarse, tiles: Sequence[Path | None]) -> Gaussians:
-    """The Gaussians of every cell: of the output of its tile, or of the coarse model where there is none."""
+    """The Gaussians of every cell: of the output of its tile, or of the coarse model where there is none. The far ones
+    come last.
+    """
     means = coarse.gaussians.means.double().numpy()
     return concatenate(
         *(
-            coarse.gaussians.select(torch.from_numpy(cell.holds(means)))
+            coarse.gaussians.select(torch.from_numpy(cell.holds(means)) & ~coarse.far)
             if path is None
             else read_gaussians(path)
             for cell, path in zip(coarse.cells, tiles, strict=True)
-        )
+        ),
+        coarse.gaussians.select(coarse.far),
     )
 
 

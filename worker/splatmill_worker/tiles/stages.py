@@ -10,6 +10,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import torch
+from torch import Tensor
+
 from splatmill.files import replacing
 from splatmill.schema import Backend, PlanEvent, Switch, TrainOptions
 from splatmill_worker.images.load import training_size
@@ -33,7 +36,7 @@ from splatmill_worker.tiles.tile import Tile, train_tile
 from splatmill_worker.tiles.units import ScenePlan, seam_name, tile_name, tile_number
 
 STEPS_SHARE = 0.5
-"""Share of the steps of a whole run that the coarse model takes, and that each tile takes after it."""
+"""Share of the steps of a whole run that the coarse model takes. A tile then takes as many on each of its photos."""
 
 CHECKPOINTS, PLAN_FILE = "checkpoints", "plan.json"
 """The folder of the checkpoints and the file of the plan of a training, in its work folder."""
@@ -154,8 +157,9 @@ def _coarse(context: Context, stages: Stages) -> dict[str, Any]:
         raise trained.failure
     shutil.rmtree(context.run.out)
     context.run.out.mkdir()
-    weights = trained.gaussians.logit_opacities.double().sigmoid().numpy()
-    cells = divide(trained.gaussians.means.double().numpy(), weights, plan.tiles)
+    near = ~coarse_model.far(trained.gaussians, decided, [view.full.camera.viewmat for view in trained.views])
+    weights = trained.gaussians.logit_opacities[near].double().sigmoid().numpy()
+    cells = divide(trained.gaussians.means[near].double().numpy(), weights, plan.tiles)
     light = planned.facts.light if decided.exposure else None
     coarse_model.Coarse.of(trained, decided, cells, most, light).write(context.run.out)
     held_out = trained.held_out
@@ -183,14 +187,15 @@ def _tile(context: Context, stages: Stages) -> dict[str, Any]:
         return {"gaussians": 0, "steps": 0, "photos": 0}  # the scene has the coarse model there
     cameras, own = joined.known_cameras(job, stages), coarse.cells[number - 1]
 
-    def scene() -> Gaussians:
+    def scene() -> tuple[Gaussians, Tensor]:
         if not last:
-            return coarse.gaussians
+            return coarse.gaussians, coarse.far
         # Cells that do not touch this one stay coarse, so that the memory of many tiles is not needed.
         trained = zip(coarse.cells, plan.tile_names, strict=False)
-        return joined.joined(
+        whole = joined.joined(
             coarse, [ended[tile].path if cell.touches(own) else None for cell, tile in trained]
         )
+        return whole, torch.arange(whole.count) >= whole.count - int(coarse.far.sum())
 
     result = train_tile(Tile(job, cameras, coarse, number - 1, scene, last), stages)
     shutil.rmtree(context.run.out)

@@ -59,7 +59,8 @@ class Tile:
     cameras: of the photos.
     coarse: the coarse model.
     number: of the cell, from 0.
-    scene: reads the Gaussians of all cells that its training starts from.
+    scene: reads the Gaussians that its training starts from, of all cells, and which of them are far, bool [N]: these
+        stay as they are (see `coarse_model.far`).
     last: this and the tiles around it are trained, but for the last steps.
     """
 
@@ -67,7 +68,7 @@ class Tile:
     cameras: Cameras
     coarse: Coarse
     number: int
-    scene: Callable[[], Gaussians]
+    scene: Callable[[], tuple[Gaussians, Tensor]]
     last: bool = False
 
 
@@ -75,7 +76,7 @@ class Tile:
 class TileResult:
     """A trained tile.
 
-    gaussians: those within its cell, in the training world.
+    gaussians: those within its cell that are not far, in the training world.
     facts: figures by name.
     """
 
@@ -88,10 +89,11 @@ def train_tile(tile: Tile, stages: Stages) -> TileResult:
     are. Raises TrainingFailed, and Cancelled.
     """
     coarse = tile.coarse
-    cell, whole = coarse.cells[tile.number], tile.scene()
+    cell = coarse.cells[tile.number]
+    whole, far = tile.scene()
     means = whole.means.double().numpy()
-    core = torch.from_numpy(cell.holds(means))
-    free = torch.from_numpy(cell.holds(means, _margin(coarse.gaussians)))
+    core = torch.from_numpy(cell.holds(means)) & ~far
+    free = torch.from_numpy(cell.holds(means, _margin(coarse.gaussians))) & ~far
     with stages.measured("load"):
         views = list(_views(tile, whole, core))
         memory.return_freed()
@@ -107,7 +109,7 @@ def train_tile(tile: Tile, stages: Stages) -> TileResult:
         context=whole.select(~free),
         most_kept=statistics_memory(plan.max_memory, photo_bytes),
     )
-    del whole, means, within  # the engine has its own
+    del whole, far, means, within  # the engine has its own
 
     def progress(progress: TrainingProgress) -> None:
         tile.job.emit(
@@ -158,13 +160,17 @@ def tile_plan(coarse: Coarse, free: int, photos: int, *, last: bool = False) -> 
 
     last: of its last steps, in which no Gaussians are added.
 
-    All its steps are as many as the coarse training took, but at least two. It sets no photo aside: the coarse model
-    has been trained on all of them, so that they could judge no more.
+    Each of its photos comes as often as in the coarse training, in the parts that show the tile, and two steps are
+    taken at least. So a Gaussian gets as many steps as in one piece, however many tiles there are (decisions:
+    tile-steps). No photo is set aside: the coarse model has been trained on all of them, so that they could judge no
+    more.
     """
     plan, schedule = coarse.plan, coarse.plan.schedule
     until, boost = 1.0 - LAST, schedule.annealing.boost
-    first = max(1, min(coarse.steps - 1, round(until * coarse.steps)))
-    steps = max(1, coarse.steps - first) if last else first
+    share = photos / len(coarse.viewmats)
+    every = max(2, round(share * coarse.steps))
+    first = max(1, min(every - 1, round(until * every)))
+    steps = every - first if last else first
     assert boost is not None
     annealing = replace(
         schedule.annealing,
@@ -187,7 +193,7 @@ def tile_plan(coarse: Coarse, free: int, photos: int, *, last: bool = False) -> 
         target_psnr=None,
         lpips=False,
         schedule=replace(
-            schedule.seen_by(photos / len(coarse.viewmats)),
+            schedule.seen_by(share, every),
             budget=Budget(steps=steps),
             expected_steps=steps,
             longest=None,

@@ -188,12 +188,14 @@ def test_the_course_is_counted_in_steps_that_have_a_part_of_the_scene_in_view() 
     assert alone.position_scale == 1.0
     assert course.position_scale == pytest.approx(0.05**0.5)
     assert "2.5 % of the points in view" in together.reasons["densify"]
-    whole = course.seen_by(0.05)
-    assert (whole.densify_from, whole.densify_every, whole.in_view) == (300, 100, 1.0)
-    half = course.seen_by(0.1)
-    assert (half.densify_from, half.densify_every, half.in_view) == (600, 200, 0.5)
+    whole = course.seen_by(0.05, 1000)
+    assert (whole.densify_from, whole.densify_every, whole.in_view) == (125, 50, 1.0)
+    half = course.seen_by(0.1, 2000)
+    assert (half.densify_from, half.densify_every, half.in_view) == (250, 100, 0.5)
     assert half.position_scale == course.position_scale, "of the same extent"
-    assert alone.seen_by(0.3) == alone
+    assert course.seen_by(1.0, 20_000) == course
+    part = alone.seen_by(0.5, 500)
+    assert (part.densify_from, part.densify_every, part.in_view) == (62, 40, 1.0)
 
 
 @pytest.mark.parametrize("share", [1e-3, 0.01, 0.05, 0.2, 0.49, 0.5, 1.0])

@@ -64,9 +64,15 @@ class Schedule:
     position_scale: float = 1.0
     earlier_visits: float = 0.0
 
-    def seen_by(self, photos: float) -> Schedule:
-        """The schedule for a part of the scene that this share of the photos shows, above 0, trained on these alone."""
-        return self.course(self.expected_steps, min(1.0, self.in_view / photos))
+    def seen_by(self, photos: float, steps: int) -> Schedule:
+        """The schedule for a part of the scene that this share of the photos shows, above 0, trained on these alone for
+        so many steps. Where all of them do, it stays as it is.
+        """
+        if photos == 1.0:
+            return self
+        share = min(1.0, self.in_view / photos)
+        first, every = densification(steps, share)
+        return replace(self, in_view=share, densify_from=first, densify_every=every)
 
     def course(self, steps: int, share: float) -> Schedule:
         """The schedule with the densification of so many steps, and this share in view; where all is, it stays as it
