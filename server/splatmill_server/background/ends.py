@@ -18,7 +18,10 @@ from splatmill_server.jobs.records import Jobs
 log = structlog.get_logger()
 
 _WAIT = 5.0
-"""Seconds that a request to Redis waits for an end, after which another one is sent: the connection may be broken."""
+"""Seconds that Redis waits for an end before it answers that there is none."""
+
+_LATE = 10.0
+"""Seconds after that without an answer, after which the connection counts as broken."""
 
 _PAUSE = 1.0
 """Seconds to wait where Redis cannot be reached."""
@@ -35,11 +38,12 @@ class Ends:
         """Retire jobs that have ended until this task is cancelled."""
         while True:
             try:
-                end = await cast(Any, self._connection.brpop([keys.ENDS], timeout=_WAIT))
+                async with asyncio.timeout(_WAIT + _LATE):
+                    end = await cast(Any, self._connection.brpop([keys.ENDS], timeout=_WAIT))
                 if end is not None:
                     await run_in_threadpool(self._jobs.retire, end[1].decode())
-            except redis.RedisError as error:
-                log.warning("the ends of jobs cannot be read", error=str(error))
+            except (redis.RedisError, TimeoutError) as error:
+                log.warning("the ends of jobs cannot be read", error=str(error) or "Redis does not answer")
                 await asyncio.sleep(_PAUSE)
             except Exception:
                 log.exception("the end of a job waits for the reaper")

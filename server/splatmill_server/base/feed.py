@@ -10,8 +10,8 @@ import asyncio
 import heapq
 import time
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
+from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -25,6 +25,9 @@ from splatmill.backplane.jobs.events import START, StoredEvent, stream_order
 from splatmill_server.base import cancelling
 
 log = structlog.get_logger()
+
+_ANSWER_SECONDS = 10.0
+"""Seconds without an answer, after which Redis counts as lost: the connection may have broken without being closed."""
 
 BLOCK_MS = 250
 """Milliseconds that the reader waits for new entries, after which it reads the rows again and sees who else follows."""
@@ -172,7 +175,9 @@ class Feed:
         for job_id in job_ids:
             for stream in events.BOUNDS:
                 pipe.xrevrange(stream(job_id), count=1)
-        last = iter([reply[0][0].decode() if reply else START for reply in await pipe.execute()])
+        async with _answering():
+            replies = await pipe.execute()
+        last = iter([reply[0][0].decode() if reply else START for reply in replies])
         return {job_id: [next(last) for _ in events.BOUNDS] for job_id in job_ids}
 
     async def _run(self) -> None:
@@ -233,14 +238,26 @@ class Feed:
         pipe = self._redis.pipeline(transaction=False)
         for job_id in job_ids:
             pipe.hgetall(keys.job(job_id))
-        rows = await pipe.execute()
+        async with _answering():
+            rows = await pipe.execute()
         positions: Any = {
             stream(job_id): entry
             for job_id in job_ids
             for stream, entry in zip(events.BOUNDS, entries[job_id], strict=True)
         }
-        reply: Any = await self._redis.xread(positions, block=block)
+        async with _answering():
+            reply: Any = await self._redis.xread(positions, block=block)
         return rows, {name.decode(): new_entries for name, new_entries in reply or []}
+
+
+@asynccontextmanager
+async def _answering() -> AsyncIterator[None]:
+    """Bound a request to Redis, whose client has no timeout. Raises redis.TimeoutError after _ANSWER_SECONDS."""
+    try:
+        async with asyncio.timeout(_ANSWER_SECONDS):
+            yield
+    except TimeoutError:
+        raise redis.TimeoutError(f"Redis has not answered for {_ANSWER_SECONDS:g} seconds.") from None
 
 
 def is_beyond(entry: str, end: str) -> bool:

@@ -1,6 +1,7 @@
 """Tasks end, also those that have lost a cancellation."""
 
 import asyncio
+from contextlib import suppress
 
 import pytest
 
@@ -30,6 +31,28 @@ def test_a_task_that_lost_a_cancellation_is_cancelled_again(monkeypatch: pytest.
 
     assert asyncio.run(ended()) == (True, True)
     assert lost == 3
+
+
+def test_who_is_cancelled_while_it_ends_a_task_waits_for_that_and_ends_then(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(cancelling, "_AGAIN_SECONDS", 0.05)
+
+    async def slow() -> None:
+        for _ in range(3):
+            with suppress(asyncio.CancelledError):
+                await asyncio.sleep(60)
+
+    async def ended() -> tuple[bool, bool]:
+        inner = asyncio.create_task(slow())
+        await asyncio.sleep(0)
+        ending = asyncio.create_task(cancelling.end(inner))
+        await asyncio.sleep(0)
+        ending.cancel()
+        await asyncio.wait({ending})
+        return ending.cancelled(), inner.done()
+
+    assert asyncio.run(ended()) == (True, True)
 
 
 def test_what_a_task_raises_at_its_end_is_dropped(caplog: pytest.LogCaptureFixture) -> None:

@@ -21,7 +21,7 @@ from splatmill.backplane.jobs import events
 from splatmill.schema import JobState, LogEvent, ProgressEvent, StateEvent
 from splatmill_server.access.caller import Caller
 from splatmill_server.base import feed
-from splatmill_server.base.feed import Batch, Feed
+from splatmill_server.base.feed import Batch, Feed, Subscription
 from tests.support.served_app import Serve, ServedApp, problem
 from tests.support.servers.server_events import brief, follow
 from tests.support.waiting import wait_for
@@ -199,6 +199,34 @@ def test_a_follower_that_is_too_slow_reads_again_what_it_has_missed(
         await client.aclose()
 
     asyncio.run(slow())
+
+
+async def all_that_come(subscription: Subscription) -> None:
+    while True:
+        await subscription.next(1.0)
+
+
+def test_followers_are_told_that_redis_does_not_answer(
+    connection: redis.Redis, redis_url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(feed, "_ANSWER_SECONDS", 1.0)
+    job_id = "job00001"
+    connection.hset(keys.job(job_id), "id", job_id)
+
+    async def follow() -> None:
+        client = connect_async(redis_url)
+        reader = Feed(client)
+        subscription = reader.subscribe(job_id)
+        await reader.catch_up(subscription, [events.START] * len(events.BOUNDS))
+        connection.client_pause(3000)
+        with pytest.raises(redis.TimeoutError, match="has not answered for 1 seconds"):
+            await all_that_come(subscription)
+        reader.close(subscription)
+        await reader.stop()
+        await client.aclose()
+
+    asyncio.run(follow())
+    connection.client_unpause()
 
 
 @pytest.mark.parametrize(

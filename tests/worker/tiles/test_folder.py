@@ -11,6 +11,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -84,10 +85,21 @@ def test_a_claim_of_a_killed_process_of_this_machine_is_free_at_once(shared: Pla
     assert len(list((shared.root / "units").iterdir())) == 1
 
 
-def test_a_claim_of_another_machine_holds_while_it_is_renewed(shared: PlanFolder) -> None:
+@pytest.mark.parametrize(
+    "elsewhere",
+    [
+        {"machine": "m"},
+        {"boot": "b"},  # a machine with the same name
+        {"namespace": "n"},
+        {"machine": "", "boot": "", "namespace": ""},
+    ],
+)
+def test_a_claim_of_another_machine_holds_while_it_is_renewed(
+    shared: PlanFolder, elsewhere: dict[str, Any]
+) -> None:
     (shared.root / "units").mkdir()
     claim = shared.root / "units" / f"cameras-{shared.plan.key('cameras', {})}.claim"
-    process = replace(ProcessIdentity.of(os.getpid()), machine="m", started="0")
+    process = replace(ProcessIdentity.of(os.getpid()), **elsewhere, started="0")
     claim.write_text(json.dumps({"token": "t", "host": "elsewhere", **process.dump()}))
     with pytest.raises(Claimed):
         do(shared, "cameras")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -19,17 +18,12 @@ from splatmill_worker.scene import Camera
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.plan.light import Light
 from splatmill_worker.splat.plan.plan import Plan
-from splatmill_worker.splat.start.far_shell import DISTANCE
 from splatmill_worker.splat.train.loop import Trained
 from splatmill_worker.tiles.cells import Cell
 
 Float = npt.NDArray[np.float64]
 
 GAUSSIANS, PHOTOS, FACTS = "gaussians.npz", "photos.npz", "coarse.json"
-
-FAR = DISTANCE / 2.0
-"""Distance from the cameras' mean from which a Gaussian is far, over that within which nine in ten lie: on the way to
-the far shell."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +65,7 @@ class Coarse:
     @cached_property
     def far(self) -> Tensor:
         """Which of the Gaussians no tile trains, bool [N] (see `far`)."""
-        return far(self.gaussians, self.plan, list(self.viewmats.values()))
+        return far(self.gaussians, self.plan)
 
     def corrected(self, name: str, camera: Camera) -> Camera:
         """The camera of a training photo as the coarse training left it."""
@@ -100,22 +94,19 @@ class Coarse:
         atomic_write(folder / FACTS, json.dumps(document, indent=1))
 
 
-def far(gaussians: Gaussians, plan: Plan, viewmats: Sequence[Float]) -> Tensor:
-    """Which Gaussians of a coarse model are so far behind the scene that no tile trains them, bool [N].
+def far(gaussians: Gaussians, plan: Plan) -> Tensor:
+    """Which Gaussians of a coarse model no tile trains, bool [N].
 
+    In a scene of which photos have less than half in view, these are all from half way to the far shell on.
     Photos of all tiles show them, in particular through what the coarse training has not closed yet: a tile that had
-    some of them would be trained on every photo of the scene. Where a photo has half of the scene in view, all photos
-    show every tile anyway, and none counts as far (decisions: tile-steps).
-
-    viewmats: of the photos, world to camera [4, 4].
+    some of them would be trained on every photo of the scene (decisions: tile-steps). Where photos have half of the
+    scene in view, every photo shows every tile anyway.
     """
-    if plan.schedule.in_view == 1.0:
+    within = plan.schedule.decay_within
+    if within is None or plan.schedule.in_view == 1.0:
         return torch.zeros(gaussians.count, dtype=torch.bool)
-    centers = np.array([-viewmat[:3, :3].T @ viewmat[:3, 3] for viewmat in viewmats])
-    middle = centers.mean(axis=0)
-    distances = np.linalg.norm(gaussians.means.double().numpy() - middle, axis=1)
-    spread = np.linalg.norm(centers - middle, axis=1).max()
-    return torch.from_numpy(distances > FAR * max(float(np.percentile(distances, 90)), float(spread)))
+    distances: Tensor = gaussians.means.norm(dim=1)
+    return distances >= within
 
 
 def read(folder: Path) -> Coarse:

@@ -314,10 +314,14 @@ def _read(path: Path) -> dict[str, Any] | None:
 
 
 def _has_ended(claim: Path) -> bool:
-    """Whether the process of a claim was one of this machine and runs no more; False where that cannot be seen."""
+    """Whether the process of a claim was one of this machine and runs no more; False where that cannot be seen.
+
+    That the machine has been started again since then is not enough: machines that share the folder may have one name.
+    """
     try:
-        return ProcessIdentity.load(_read(claim) or {}).dead()
-    except (KeyError, TypeError, ValueError):
+        theirs = ProcessIdentity.load(_read(claim) or {})
+        return bool(theirs.boot) and theirs.boot == ProcessIdentity.of(os.getpid()).boot and theirs.dead()
+    except (KeyError, TypeError, ValueError, OSError):
         return False
 
 

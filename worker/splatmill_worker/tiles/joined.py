@@ -118,8 +118,7 @@ def write_scene(joining: Joining) -> dict[str, Any]:
     planned = plan_training(job, cameras, lambda plan: plan, stages)
     photos = _corrected(planned_photos(job, cameras, planned, stages), coarse)
     planned = replace(planned, plan=_stated(joining))
-    gaussians = joining.gaussians()
-    engine = open_engine(gaussians, job.kernels)
+    engine = open_engine(joining.gaussians(), job.kernels)
     trained = _trained(joining, engine, photos)
     record = Recording(TrainingEvents(job.emit, job.workdir, coarse.plan, photos.shown), None, None)
     for sentence in joining.failures:
@@ -127,13 +126,13 @@ def write_scene(joining: Joining) -> dict[str, Any]:
     write_files(job, cameras, planned, photos, engine, trained, record, stages)
     held_out = trained.held_out
     return {
-        "gaussians": gaussians.count,
+        "gaussians": engine.count,
         "steps": trained.steps,
         "train_seconds": round(trained.seconds, 2),
         "psnr": None if held_out is None else held_out.psnr,
         "ssim": None if held_out is None else held_out.ssim,
         "failed": [number for number, tile in enumerate(joining.tiles, 1) if tile.path is None],
-        "seams": _seams(joining, gaussians, photos),
+        "seams": _seams(joining, engine, photos),
     }
 
 
@@ -220,12 +219,13 @@ def _scores(job: Job, engine: Engine, plan: Plan, photos: Photos) -> tuple[Score
     return held_out, evaluate(render, finally_evaluated(photos.training), background)
 
 
-def _seams(joining: Joining, gaussians: Gaussians, photos: Photos) -> dict[str, Any] | None:
+def _seams(joining: Joining, engine: Engine, photos: Photos) -> dict[str, Any] | None:
     """How the held-out photos are shown where two tiles meet; None without such photos or with one tile."""
     views: Sequence[TrainingView] = photos.held_out
     if not views or len(joining.coarse.cells) < 2:
         return None
     means = joining.coarse.gaussians.means.double().numpy()
-    members: list[Tensor] = [torch.from_numpy(cell.holds(means)) for cell in joining.coarse.cells]
+    near = ~joining.coarse.far
+    members: list[Tensor] = [torch.from_numpy(cell.holds(means)) & near for cell in joining.coarse.cells]
     seams = Seams(joining.coarse.gaussians, members, joining.coarse.plan)
-    return asdict(seams.measured(gaussians, views))
+    return asdict(seams.measured(engine, views))

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from splatmill_worker.splat.engine.cpu import CpuEngine
+from splatmill_worker.splat.engine.protocol import Engine
 from splatmill_worker.splat.evaluate import psnr
 from splatmill_worker.splat.gaussians import SH_C0, Gaussians
 from splatmill_worker.splat.plan.plan import Plan
@@ -60,10 +61,10 @@ class Seams:
     def __init__(self, coarse: Gaussians, members: Sequence[Tensor], plan: Plan) -> None:
         self._coarse, self._members, self._plan = coarse, members, plan
 
-    def measured(self, scene: Gaussians, views: Sequence[TrainingView]) -> SeamScore:
+    def measured(self, scene: Engine, views: Sequence[TrainingView]) -> SeamScore:
         """The errors of `scene` and of the coarse model on the two parts of `views`."""
         background = evaluation_background(self._plan, views)
-        renders = [renderer(CpuEngine(each), self._plan) for each in (scene, self._coarse)]
+        renders = [renderer(each, self._plan) for each in (scene, CpuEngine(self._coarse))]
         sums = torch.zeros(2, 2, dtype=torch.float64)  # by model, then seams and others
         counts = torch.zeros(2, dtype=torch.float64)
         for view, seams in zip(views, self._of(views), strict=True):
@@ -73,7 +74,9 @@ class Seams:
             counts += torch.tensor([float(part.sum()) for part in parts])
             photo = target.over(background).float() / 255.0
             for row, render in enumerate(renders):
-                error = (render(target, background).clamp(0.0, 1.0) - photo).square().mean(dim=2).double()
+                error = (
+                    (render(target, background).cpu().clamp(0.0, 1.0) - photo).square().mean(dim=2).double()
+                )
                 sums[row] += torch.stack([error[part].sum() for part in parts])
         values = [
             None if counts[part] == 0 else psnr(float(sums[row, part] / counts[part]))

@@ -36,7 +36,7 @@ from splatmill_worker.tiles.tile import Tile, train_tile
 from splatmill_worker.tiles.units import ScenePlan, seam_name, tile_name, tile_number
 
 STEPS_SHARE = 0.5
-"""Share of the steps of a whole run that the coarse model takes. A tile then takes as many on each of its photos."""
+"""Share of the steps of a whole run that the coarse model takes. A tile then uses each of its photos as often."""
 
 CHECKPOINTS, PLAN_FILE = "checkpoints", "plan.json"
 """The folder of the checkpoints and the file of the plan of a training, in its work folder."""
@@ -157,7 +157,7 @@ def _coarse(context: Context, stages: Stages) -> dict[str, Any]:
         raise trained.failure
     shutil.rmtree(context.run.out)
     context.run.out.mkdir()
-    near = ~coarse_model.far(trained.gaussians, decided, [view.full.camera.viewmat for view in trained.views])
+    near = ~coarse_model.far(trained.gaussians, decided)
     weights = trained.gaussians.logit_opacities[near].double().sigmoid().numpy()
     cells = divide(trained.gaussians.means[near].double().numpy(), weights, plan.tiles)
     light = planned.facts.light if decided.exposure else None

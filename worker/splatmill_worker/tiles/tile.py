@@ -76,7 +76,7 @@ class Tile:
 class TileResult:
     """A trained tile.
 
-    gaussians: those within its cell that are not far, in the training world.
+    gaussians: the trained ones within its cell, in the training world.
     facts: figures by name.
     """
 
@@ -160,10 +160,9 @@ def tile_plan(coarse: Coarse, free: int, photos: int, *, last: bool = False) -> 
 
     last: of its last steps, in which no Gaussians are added.
 
-    Each of its photos comes as often as in the coarse training, in the parts that show the tile, and two steps are
-    taken at least. So a Gaussian gets as many steps as in one piece, however many tiles there are (decisions:
-    tile-steps). No photo is set aside: the coarse model has been trained on all of them, so that they could judge no
-    more.
+    Each photo that shows the tile is used as often as in the coarse training, and two steps are taken at least. So a
+    Gaussian gets about as many steps as in one piece, however many tiles there are (decisions: tile-steps). No photo is
+    set aside: the coarse model has been trained on all of them, so that they could judge no more.
     """
     plan, schedule = coarse.plan, coarse.plan.schedule
     until, boost = 1.0 - LAST, schedule.annealing.boost

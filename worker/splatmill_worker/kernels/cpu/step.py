@@ -138,10 +138,13 @@ class Step:
             )
         self._order = order
         self.blocks = blocks.pack(ordered, self._rows, self.threads, order)
-        self.exp_avg, self.exp_avg_sq = (
-            blocks.empty(self._rows) if moment is None else blocks.pack_rows(moment, self.threads, order)
-            for moment in (exp_avg, exp_avg_sq)
-        )
+        self._moments: tuple[Tensor, Tensor] | None = None  # of zeros, until they are asked for
+        if exp_avg is not None or exp_avg_sq is not None:
+            first, second = (
+                blocks.empty(self._rows) if moment is None else blocks.pack_rows(moment, self.threads, order)
+                for moment in (exp_avg, exp_avg_sq)
+            )
+            self._moments = first, second
         self._clusters = engine.Clusters(*self._state, self._rows, self.threads) if self.clustered else None
         self._scores = torch.zeros(3, len(self.blocks) * blocks.LANES)
         self._rendered = False
@@ -179,6 +182,21 @@ class Step:
             for rows in (self.exp_avg, self.exp_avg_sq)
         )
         return first, second
+
+    @property
+    def exp_avg(self) -> Tensor:
+        """The first moments."""
+        return self._with_moments()[0]
+
+    @property
+    def exp_avg_sq(self) -> Tensor:
+        """The second moments."""
+        return self._with_moments()[1]
+
+    def _with_moments(self) -> tuple[Tensor, Tensor]:
+        if self._moments is None:  # an engine that only renders needs none
+            self._moments = blocks.empty(self._rows), blocks.empty(self._rows)
+        return self._moments
 
     @property
     def share_computed(self) -> float:

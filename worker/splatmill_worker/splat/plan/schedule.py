@@ -66,7 +66,7 @@ class Schedule:
 
     def seen_by(self, photos: float, steps: int) -> Schedule:
         """The schedule for a part of the scene that this share of the photos shows, above 0, trained on these alone for
-        so many steps. Where all of them do, it stays as it is.
+        so many steps. Where all photos show it, the schedule stays as it is, whatever the steps.
         """
         if photos == 1.0:
             return self
