@@ -13,6 +13,7 @@ from redis.asyncio import Redis as AsyncRedis
 from starlette.concurrency import run_in_threadpool
 
 from splatmill.backplane import keys
+from splatmill_server.base.feed import answering
 from splatmill_server.jobs.records import Jobs
 
 log = structlog.get_logger()
@@ -38,12 +39,12 @@ class Ends:
         """Retire jobs that have ended until this task is cancelled."""
         while True:
             try:
-                async with asyncio.timeout(_WAIT + _LATE):
+                async with answering(_WAIT + _LATE):
                     end = await cast(Any, self._connection.brpop([keys.ENDS], timeout=_WAIT))
                 if end is not None:
                     await run_in_threadpool(self._jobs.retire, end[1].decode())
-            except (redis.RedisError, TimeoutError) as error:
-                log.warning("the ends of jobs cannot be read", error=str(error) or "Redis does not answer")
+            except redis.RedisError as error:
+                log.warning("the ends of jobs cannot be read", error=str(error))
                 await asyncio.sleep(_PAUSE)
             except Exception:
                 log.exception("the end of a job waits for the reaper")

@@ -3,6 +3,8 @@
 import asyncio
 from typing import Any
 
+from anyio import CancelScope
+
 _AGAIN_SECONDS = 2.0
 """Seconds after which a task that still runs is cancelled again; what tasks do at their end takes less, as a rule."""
 
@@ -15,13 +17,18 @@ async def end(*tasks: asyncio.Future[Any]) -> None:
     loses the cancellation if both come in the same turn of the event loop (CPython before 3.12).
     """
     cancelled: asyncio.CancelledError | None = None
-    while running := [task for task in tasks if not task.done()]:
-        for task in running:
-            task.cancel()
-        try:
-            await asyncio.wait(running, timeout=_AGAIN_SECONDS)
-        except asyncio.CancelledError as error:
-            cancelled = error
+    clock, again = asyncio.get_running_loop().time, 0.0
+    # A scope of anyio, as that of a response whose client has left, cancels at each turn of the event loop.
+    with CancelScope(shield=True):
+        while running := [task for task in tasks if not task.done()]:
+            if clock() >= again:
+                for task in running:
+                    task.cancel()
+                again = clock() + _AGAIN_SECONDS
+            try:
+                await asyncio.wait(running, timeout=again - clock())
+            except asyncio.CancelledError as error:
+                cancelled = error
     for task in tasks:
         if not task.cancelled():
             task.exception()  # otherwise asyncio reports it as not retrieved

@@ -26,8 +26,9 @@ from splatmill_server.base import cancelling
 
 log = structlog.get_logger()
 
-_ANSWER_SECONDS = 10.0
-"""Seconds without an answer, after which Redis counts as lost: the connection may have broken without being closed."""
+_ANSWER_SECONDS = 30.0
+"""Seconds without an answer, after which Redis counts as lost: the connection may have broken without being closed. A
+command may wait for a free connection for a part of them."""
 
 BLOCK_MS = 250
 """Milliseconds that the reader waits for new entries, after which it reads the rows again and sees who else follows."""
@@ -175,7 +176,7 @@ class Feed:
         for job_id in job_ids:
             for stream in events.BOUNDS:
                 pipe.xrevrange(stream(job_id), count=1)
-        async with _answering():
+        async with answering():
             replies = await pipe.execute()
         last = iter([reply[0][0].decode() if reply else START for reply in replies])
         return {job_id: [next(last) for _ in events.BOUNDS] for job_id in job_ids}
@@ -238,26 +239,29 @@ class Feed:
         pipe = self._redis.pipeline(transaction=False)
         for job_id in job_ids:
             pipe.hgetall(keys.job(job_id))
-        async with _answering():
+        async with answering():
             rows = await pipe.execute()
         positions: Any = {
             stream(job_id): entry
             for job_id in job_ids
             for stream, entry in zip(events.BOUNDS, entries[job_id], strict=True)
         }
-        async with _answering():
+        async with answering():
             reply: Any = await self._redis.xread(positions, block=block)
         return rows, {name.decode(): new_entries for name, new_entries in reply or []}
 
 
 @asynccontextmanager
-async def _answering() -> AsyncIterator[None]:
-    """Bound a request to Redis, whose client has no timeout. Raises redis.TimeoutError after _ANSWER_SECONDS."""
+async def answering(seconds: float | None = None) -> AsyncIterator[None]:
+    """Bound a request to Redis, whose client has no timeout. Raises redis.TimeoutError after `seconds`, by default
+    _ANSWER_SECONDS.
+    """
+    seconds = _ANSWER_SECONDS if seconds is None else seconds
     try:
-        async with asyncio.timeout(_ANSWER_SECONDS):
+        async with asyncio.timeout(seconds):
             yield
     except TimeoutError:
-        raise redis.TimeoutError(f"Redis has not answered for {_ANSWER_SECONDS:g} seconds.") from None
+        raise redis.TimeoutError(f"Redis has not answered for {seconds:g} seconds.") from None
 
 
 def is_beyond(entry: str, end: str) -> bool:

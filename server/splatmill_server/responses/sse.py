@@ -22,7 +22,7 @@ from splatmill.backplane.jobs.row import JobRow
 from splatmill.backplane.storage.records import UnreadableRecord, warn
 from splatmill.schema import EventRecord, Job, JobState, StateEvent, Time
 from splatmill_server.base import cancelling
-from splatmill_server.base.feed import Batch, Row, is_beyond
+from splatmill_server.base.feed import Batch, Row, answering, is_beyond
 from splatmill_server.service import Service
 
 _ENTRY = r"\d{1,19}-\d{1,19}"
@@ -104,7 +104,10 @@ class Follower:
         known = zip(self.position.entries, ends, strict=True)
         self.position.entries = [min(pair, key=stream_order) for pair in known]
         if self.position.states != START:
-            states = await cast(Any, self.redis.xrange(keys.states(self.job_id), max=self.position.states))
+            async with answering():
+                states = await cast(
+                    Any, self.redis.xrange(keys.states(self.job_id), max=self.position.states)
+                )
             for stored in events.decode(states, keys.states(self.job_id)):
                 self.fold.apply(stored)
         if self.position.row_events > 2 * row.generation:

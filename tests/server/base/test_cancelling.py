@@ -4,6 +4,7 @@ import asyncio
 from contextlib import suppress
 
 import pytest
+from anyio import create_task_group
 
 from splatmill_server.base import cancelling
 
@@ -39,7 +40,7 @@ def test_who_is_cancelled_while_it_ends_a_task_waits_for_that_and_ends_then(
     monkeypatch.setattr(cancelling, "_AGAIN_SECONDS", 0.05)
 
     async def slow() -> None:
-        for _ in range(3):
+        for _ in range(2):
             with suppress(asyncio.CancelledError):
                 await asyncio.sleep(60)
 
@@ -53,6 +54,33 @@ def test_who_is_cancelled_while_it_ends_a_task_waits_for_that_and_ends_then(
         return ending.cancelled(), inner.done()
 
     assert asyncio.run(ended()) == (True, True)
+
+
+def test_a_task_ends_in_peace_where_the_client_of_a_response_has_left() -> None:
+    cancelled = 0
+
+    async def follow() -> None:
+        nonlocal cancelled
+        try:
+            await asyncio.sleep(60)
+        finally:
+            for _ in range(20):  # what it does at its end takes some turns of the event loop
+                try:
+                    await asyncio.sleep(0.001)
+                except asyncio.CancelledError:
+                    cancelled += 1
+
+    async def response() -> bool:
+        task = asyncio.create_task(follow())
+        await asyncio.sleep(0)
+        async with create_task_group() as group:
+            group.start_soon(cancelling.end, task)
+            await asyncio.sleep(0.005)
+            group.cancel_scope.cancel()
+        return task.done()
+
+    assert asyncio.run(response())
+    assert cancelled == 0
 
 
 def test_what_a_task_raises_at_its_end_is_dropped(caplog: pytest.LogCaptureFixture) -> None:

@@ -97,7 +97,7 @@ class Coarse:
 def far(gaussians: Gaussians, plan: Plan) -> Tensor:
     """Which Gaussians of a coarse model no tile trains, bool [N].
 
-    In a scene of which photos have less than half in view, these are all from half way to the far shell on.
+    In a scene of which photos have less than half in view, these are all beyond half the distance to the far shell.
     Photos of all tiles show them, in particular through what the coarse training has not closed yet: a tile that had
     some of them would be trained on every photo of the scene (decisions: tile-steps). Where photos have half of the
     scene in view, every photo shows every tile anyway.

@@ -75,7 +75,10 @@ class Seams:
             photo = target.over(background).float() / 255.0
             for row, render in enumerate(renders):
                 error = (
-                    (render(target, background).cpu().clamp(0.0, 1.0) - photo).square().mean(dim=2).double()
+                    (render(target, background).detach().cpu().clamp(0.0, 1.0) - photo)
+                    .square()
+                    .mean(dim=2)
+                    .double()
                 )
                 sums[row] += torch.stack([error[part].sum() for part in parts])
         values = [
@@ -86,7 +89,7 @@ class Seams:
         return SeamScore(float(counts[0] / counts.sum().clamp_min(1.0)), *values)
 
     def _of(self, views: Sequence[TrainingView]) -> Iterator[Tensor]:
-        """For each view bool [H, W]: pixels that the scene fills, and most of whose light is of no one tile.
+        """For each view bool [H, W]: pixels that the tiles fill, and most of whose light is of no one tile.
 
         They are found on views reduced as for the parts of photos, of three tiles at a time, so that many tiles need
         the memory of three.

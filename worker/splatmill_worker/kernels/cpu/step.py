@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -138,13 +139,10 @@ class Step:
             )
         self._order = order
         self.blocks = blocks.pack(ordered, self._rows, self.threads, order)
-        self._moments: tuple[Tensor, Tensor] | None = None  # of zeros, until they are asked for
-        if exp_avg is not None or exp_avg_sq is not None:
-            first, second = (
-                blocks.empty(self._rows) if moment is None else blocks.pack_rows(moment, self.threads, order)
-                for moment in (exp_avg, exp_avg_sq)
-            )
-            self._moments = first, second
+        for name, moment in (("exp_avg", exp_avg), ("exp_avg_sq", exp_avg_sq)):
+            self.__dict__.pop(name, None)
+            if moment is not None:
+                setattr(self, name, blocks.pack_rows(moment, self.threads, order))
         self._clusters = engine.Clusters(*self._state, self._rows, self.threads) if self.clustered else None
         self._scores = torch.zeros(3, len(self.blocks) * blocks.LANES)
         self._rendered = False
@@ -183,20 +181,15 @@ class Step:
         )
         return first, second
 
-    @property
+    @cached_property
     def exp_avg(self) -> Tensor:
-        """The first moments."""
-        return self._with_moments()[0]
+        """The first moments: zeros, made when they are first used, since an engine that only renders needs none."""
+        return blocks.empty(self._rows)
 
-    @property
+    @cached_property
     def exp_avg_sq(self) -> Tensor:
-        """The second moments."""
-        return self._with_moments()[1]
-
-    def _with_moments(self) -> tuple[Tensor, Tensor]:
-        if self._moments is None:  # an engine that only renders needs none
-            self._moments = blocks.empty(self._rows), blocks.empty(self._rows)
-        return self._moments
+        """The second moments: zeros, made when they are first used."""
+        return blocks.empty(self._rows)
 
     @property
     def share_computed(self) -> float:

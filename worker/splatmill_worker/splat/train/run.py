@@ -29,10 +29,6 @@ from splatmill_worker.splat.views import TrainingView
 SNAPSHOT_SHARE = 0.04
 """Share of the budget between two snapshots to roll back to."""
 
-SNAPSHOT_COST = 0.02
-"""Share of the time that snapshots take at most. Of a large scene of which photos show little, one takes as long as
-dozens of steps."""
-
 MEMORY_SHRINK = 0.8
 """Share of the Gaussians that is kept after memory ran out."""
 
@@ -85,7 +81,6 @@ class TrainingRun:
         self.pace = Pace(plan.schedule.expected_steps)
         self.stopped = ""
         self.last_good: Snapshot | None = None
-        self._copying_seconds = 0.0  # that the last snapshot took
         self.best: Snapshot | None = None
         self._random = torch.Generator().manual_seed(plan.seed)
 
@@ -111,7 +106,6 @@ class TrainingRun:
         if self.last_good is None or (
             progress - self.state.budget.progress(self.last_good.state.step, self.last_good.seconds)
             >= SNAPSHOT_SHARE
-            and SNAPSHOT_COST * (self.clock.seconds - self.last_good.seconds) >= self._copying_seconds
             and self.health.near_lowest
         ):
             self.last_good = self._checked_snapshot()
@@ -250,14 +244,12 @@ class TrainingRun:
 
     def _checked_snapshot(self) -> Snapshot:
         """A snapshot to roll back to. Raises TrainingFailed where parameters are not finite."""
-        began = self.clock.seconds
         snapshot = self.snapshot()
         bad = sum(int((~torch.isfinite(value)).sum()) for value in snapshot.parameters.values())
         if bad:
             raise TrainingFailed(
                 FailureName.non_finite, f"{bad} parameters are not finite.", step=self.state.step
             )
-        self._copying_seconds = self.clock.seconds - began
         return snapshot
 
     def _step(self, index: int, rates: Rates) -> StepResult:
