@@ -2,6 +2,7 @@
 
 import asyncio
 from contextlib import suppress
+from typing import Any
 
 import pytest
 from anyio import create_task_group
@@ -56,8 +57,18 @@ def test_who_is_cancelled_while_it_ends_a_task_waits_for_that_and_ends_then(
     assert asyncio.run(ended()) == (True, True)
 
 
-def test_a_task_ends_in_peace_where_the_client_of_a_response_has_left() -> None:
-    cancelled = 0
+def test_a_task_ends_in_peace_where_the_client_of_a_response_has_left(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    cancelled = waits = 0
+    wait = asyncio.wait
+
+    async def counted(*arguments: Any, **options: Any) -> Any:
+        nonlocal waits
+        waits += 1
+        return await wait(*arguments, **options)
+
+    monkeypatch.setattr(asyncio, "wait", counted)
 
     async def follow() -> None:
         nonlocal cancelled
@@ -80,7 +91,7 @@ def test_a_task_ends_in_peace_where_the_client_of_a_response_has_left() -> None:
         return task.done()
 
     assert asyncio.run(response())
-    assert cancelled == 0
+    assert (cancelled, waits) == (0, 1)
 
 
 def test_what_a_task_raises_at_its_end_is_dropped(caplog: pytest.LogCaptureFixture) -> None:

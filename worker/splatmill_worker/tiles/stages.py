@@ -36,7 +36,8 @@ from splatmill_worker.tiles.tile import Tile, train_tile
 from splatmill_worker.tiles.units import ScenePlan, seam_name, tile_name, tile_number
 
 STEPS_SHARE = 0.5
-"""Share of the steps of a whole run that the coarse model takes. A tile uses its photos as often as that."""
+"""Share of the steps of a whole run that the coarse training takes. A tile then uses each of its photos as often as the
+coarse training did."""
 
 CHECKPOINTS, PLAN_FILE = "checkpoints", "plan.json"
 """The folder of the checkpoints and the file of the plan of a training, in its work folder."""

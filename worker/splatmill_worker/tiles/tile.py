@@ -167,9 +167,9 @@ def tile_plan(coarse: Coarse, free: int, photos: int, *, last: bool = False) -> 
     plan, schedule = coarse.plan, coarse.plan.schedule
     until, boost = 1.0 - LAST, schedule.annealing.boost
     share = photos / len(coarse.viewmats)
-    every = max(2, round(share * coarse.steps))
-    first = max(1, min(every - 1, round(until * every)))
-    steps = every - first if last else first
+    total = max(2, round(share * coarse.steps))
+    first = max(1, min(total - 1, round(until * total)))
+    steps = total - first if last else first
     assert boost is not None
     annealing = replace(
         schedule.annealing,
@@ -192,7 +192,7 @@ def tile_plan(coarse: Coarse, free: int, photos: int, *, last: bool = False) -> 
         target_psnr=None,
         lpips=False,
         schedule=replace(
-            schedule.seen_by(share, every),
+            schedule.seen_by(share, total),
             budget=Budget(steps=steps),
             expected_steps=steps,
             longest=None,
