@@ -87,9 +87,9 @@ def main(argv: list[str] | None = None) -> int:
         "--capture", type=Path, required=True, help="folder of the photos, which is moved there"
     )
     plan.add_argument("--options", required=True, help="TrainOptions with tiles, as JSON")
-    unit = programs.add_parser("unit", help="do one unit of a plan, or all that are left")
+    unit = programs.add_parser("unit", help="do some units of a plan, or all that are left")
     unit.add_argument("folder", type=Path)
-    unit.add_argument("name", nargs="?")
+    unit.add_argument("names", nargs="*")
     units = programs.add_parser("units", help="list the units of a plan")
     units.add_argument("folder", type=Path)
     units.add_argument("--json", action="store_true", help="print one JSON document instead of lines")
@@ -151,7 +151,7 @@ def main(argv: list[str] | None = None) -> int:
         if chosen.program == "plan":
             return command.make_plan(chosen.folder, chosen.capture, chosen.options)
         if chosen.program == "unit":
-            return command.do_unit(chosen.folder, chosen.name)
+            return command.do_units(chosen.folder, chosen.names)
         return command.list_units(chosen.folder, as_json=chosen.json)
     if chosen.program == "doctor":
         from splatmill_worker.doctor import report

@@ -105,6 +105,8 @@ def test_renderings_have_the_context_and_lists_have_not() -> None:
     torch.testing.assert_close(shown, wanted, rtol=1e-5, atol=1e-6)
     assert engine.count == int((~apart).sum())
     assert [len(moments) for moments in engine.moments()] == [engine.count, engine.count]
+    blocks = -(-engine.count // 16)
+    assert [len(engine.exp_avg), len(engine.exp_avg_sq)] == [blocks, blocks], "none of what stays where it is"
     kept = {name: value[: engine.count // 2] for name, value in engine.parameters().items()}
     engine.replace(kept, None, None)
     assert engine.count == len(kept["means"])

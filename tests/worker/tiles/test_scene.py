@@ -26,7 +26,7 @@ from splatmill_worker.splat.formats import registry
 from splatmill_worker.splat.gaussians import concatenate
 from splatmill_worker.splat.plan.rates import RateSchedule, boost_of
 from splatmill_worker.tiles import coarse_model, command, joined
-from splatmill_worker.tiles.folder import PlanFolder, facts_of
+from splatmill_worker.tiles.folder import DONE, PlanFolder, facts_of
 from splatmill_worker.tiles.tile import tile_plan
 from tests.support import still_life
 from tests.support.made_once import made_once
@@ -114,13 +114,13 @@ def test_a_tile_goes_on_where_the_coarse_model_stopped(whole: Path) -> None:
     coarse = coarse_model.read(path)
     plan = tile_plan(coarse, free=500, photos=11)
     assert coarse.steps == 100
-    assert plan.schedule.earlier_visits == coarse.steps / len(coarse.viewmats)
+    assert plan.schedule.earlier_visits == coarse.steps / len(coarse.views)
     assert plan.schedule.reduced_until == 0
     assert plan.max_gaussians == pytest.approx(3000 * 500 / coarse.gaussians.count, abs=1)
     last = tile_plan(coarse, free=500, photos=11, last=True)
     assert (plan.schedule.budget.steps, last.schedule.budget.steps) == (80, 20)
     assert (last.densify, last.max_gaussians) == (False, 500)
-    assert last.schedule.earlier_visits == coarse.steps / len(coarse.viewmats) + 80 / 11
+    assert last.schedule.earlier_visits == coarse.steps / len(coarse.views) + 80 / 11
     first_ends, last_begins = (
         RateSchedule(1.0, each.schedule.annealing).at(progress)
         for each, progress in ((plan, 1.0), (last, 0.0))
@@ -130,7 +130,7 @@ def test_a_tile_goes_on_where_the_coarse_model_stopped(whole: Path) -> None:
     for part in (tile_plan(doubled, 500, 11, last=last).schedule for last in (False, True)):
         assert part.budget.steps is not None
         assert part.annealing.boost == boost_of(4000) < boost_of(part.budget.steps)
-    photos = len(coarse.viewmats)
+    photos = len(coarse.views)
     each = round(4000 * (photos // 3) / photos)
     third = [tile_plan(doubled, 500, photos // 3, last=last).schedule.budget.steps for last in (False, True)]
     assert third == [round(0.8 * each), each - round(0.8 * each)], "as often on each photo"
@@ -166,7 +166,12 @@ def test_no_tile_trains_what_stands_far_behind_a_large_scene(whole: Path, tmp_pa
     far = int(large.far.sum())
     assert far == 20
     assert large.far[-20:].all()
-    large.write(path)
+    anew = tmp_path / "coarse"
+    anew.mkdir()
+    large.write(anew)
+    shutil.copyfile(path / DONE, anew / DONE)
+    shutil.rmtree(path)
+    anew.rename(path)
     done("splatmill", "unit", str(root))
     ended = PlanFolder.open(root).ended()
     outputs = {name: end.path for name, end in ended.items() if end.path is not None}
@@ -282,9 +287,9 @@ def test_units_are_listed(whole: Path, tmp_path: Path, capsys: pytest.CaptureFix
     assert rows["seam-2"]["why"] == "needs tile-1"
     assert rows["scene"]["why"] == "needs tile-1, seam-1, seam-2"
     assert rows["coarse"]["psnr"] > 15
-    assert command.do_unit(root, "scene") == command.REFUSED
+    assert command.do_units(root, ["scene"]) == command.REFUSED
     assert "scene needs tile-1, seam-1, seam-2 first" in capsys.readouterr().err
-    assert command.do_unit(root, "tile-9") == command.REFUSED
+    assert command.do_units(root, ["tile-9"]) == command.REFUSED
     assert "Its units are cameras, coarse, tile-1" in capsys.readouterr().err
 
 
@@ -317,9 +322,9 @@ def test_an_attempt_that_another_machine_may_do_is_no_failure(
     asked = OPTIONS.model_copy(update={"backend": Backend.gpu})
     capture = still_life.posed_capture(tmp_path / "capture")
     assert command.make_plan(tmp_path, capture, asked.model_dump_json()) == 0
-    assert command.do_unit(tmp_path, "cameras") == 0
+    assert command.do_units(tmp_path, ["cameras"]) == 0
     lacking = absence() is not None
-    assert command.do_unit(tmp_path, "coarse") == (command.BROKEN if lacking else 0)
+    assert command.do_units(tmp_path, ["coarse"]) == (command.BROKEN if lacking else 0)
     assert ("gpu" in capsys.readouterr().err) == lacking
     assert PlanFolder.open(tmp_path).plan.ready(PlanFolder.open(tmp_path).states())[0] == (
         "coarse" if lacking else "tile-1"

@@ -27,6 +27,9 @@ def test_a_walk_in_any_order_ends_with_the_scene_unless_what_it_needs_failed(see
             assert all(need in states for need in unit.needs)
         name = choose.choice(ready)
         states[name] = "failed" if choose.random() < 0.15 else "done"
+        assert all(need in scene.before(name) for need in scene.unit(name).needs)
+    assert scene.before("tile-1") == {"cameras", "coarse"}
+    assert scene.before("scene") == {unit.name for unit in scene.units} - {"scene"}
     if states["cameras"] == "done" and states.get("coarse") == "done":
         assert set(states) == {unit.name for unit in scene.units}
     else:

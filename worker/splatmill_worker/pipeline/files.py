@@ -8,8 +8,6 @@ import av
 
 from splatmill_worker.pipeline.cameras import Cameras
 from splatmill_worker.pipeline.job import Job
-from splatmill_worker.pipeline.photos import Photos
-from splatmill_worker.pipeline.planning import Planned
 from splatmill_worker.pipeline.stage_times import Stages
 from splatmill_worker.pipeline.training import Recording
 from splatmill_worker.sfm.posed.written import write_cameras
@@ -23,8 +21,7 @@ from splatmill_worker.splat.train.renderer import renderer
 def write_files(
     job: Job,
     cameras: Cameras,
-    planned: Planned,
-    photos: Photos,
+    planned: PlannedScene,
     engine: Engine,
     trained: Trained,
     record: Recording,
@@ -33,13 +30,13 @@ def write_files(
     """Write the model, its cameras, the last preview, the film and the report."""
     plan, world = planned.plan, cameras.exported
     with stages.measured("export"):
-        exported = export(job.out, trained, plan, world, photos.held_out)
+        exported = export(job.out, trained, plan, world, planned.held_out)
         write_cameras(
             job.out / "cameras.zip",
             cameras.scene,
-            {v.name: world.camera(v.full.camera).viewmat for v in (*trained.views, *photos.held_out)},
+            {v.name: world.camera(v.full.camera).viewmat for v in (*trained.views, *planned.held_out)},
             world.offset,
-            frozenset(view.name for view in photos.held_out),
+            frozenset(view.name for view in planned.held_out),
         )
         record.events.preview(engine, trained.steps)
     if record.film is not None:
@@ -57,7 +54,7 @@ def write_files(
         stages.add("live", job.looks.seconds)
     write_report(
         job.out,
-        PlannedScene(cameras.scene, planned.facts, plan, photos.held_out),
+        planned,
         trained,
         exported,
         renderer(engine, plan),

@@ -19,6 +19,7 @@ from splatmill_worker.pipeline.stage_times import Stages
 from splatmill_worker.pipeline.training import train_scene
 from splatmill_worker.splat.engine.open import open_engine
 from splatmill_worker.splat.plan.photos import statistics_memory
+from splatmill_worker.splat.report.report import PlannedScene
 from splatmill_worker.splat.train.loop import Trained
 
 
@@ -89,5 +90,6 @@ def run(
     except Cancelled:
         return Outcome("cancelled", workdir / "out")
     emit(StateEvent(state=JobState.exporting))
-    write_files(job, cameras, planned, photos, engine, trained, record, stages)
+    scene = PlannedScene(cameras.scene, planned.facts.as_dict(), plan, photos.held_out)
+    write_files(job, cameras, scene, engine, trained, record, stages)
     return Outcome("succeeded", job.out, trained)

@@ -315,6 +315,5 @@ def _cameras_alone(stored: ModelCameras) -> _Views:
     for view in scene.views:
         camera = frame.camera(view.camera)
         black = torch.zeros(camera.height, camera.width, 3, dtype=torch.uint8)
-        viewmat, K = (torch.as_tensor(m, dtype=torch.float32) for m in (camera.viewmat, camera.K))
-        views.append(TrainingView(view.name, {1: Target(camera, viewmat, K, black, None, None)}))
+        views.append(TrainingView(view.name, {1: Target.of(camera, black)}))
     return _Views(frame, (0.0, 0.0, 0.0), views, [], photos=False)

@@ -83,7 +83,7 @@ class JobFolder:
         for path in self.capture.rglob("*") if self.capture.is_dir() else ():
             if not path.is_dir() and path not in entries:
                 path.unlink()
-        self._check_space(entries)
+        self.check_space(entries)
         stage(self.storage, entries, report)
         missing = [
             path.relative_to(self.capture).as_posix()
@@ -94,7 +94,7 @@ class JobFolder:
             raise CaptureIncomplete(self.capture_id, missing, len(entries))
         return len(entries)
 
-    def _check_space(self, wanted: Mapping[Path, Entry]) -> None:
+    def check_space(self, wanted: Mapping[Path, Entry]) -> None:
         """Raise DiskReserveReached if copies of the files that are missing would not fit beside the reserve."""
         root = self.storage.root
         if root is not None and root.stat().st_dev == self.path.stat().st_dev:
@@ -178,7 +178,7 @@ class JobFolder:
 
 
 class TileFolder(JobFolder):
-    """A folder of tiles of a job that another worker has: the capture, and what units have made.
+    """A folder of tiles of a job that another worker has: what units have made.
 
     It is one of several, `work/{job}_1` and so on, as many as processes on this machine do tiles of the job at a time.
     It is kept for the next tile.

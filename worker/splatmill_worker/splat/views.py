@@ -41,6 +41,12 @@ class Target(NamedTuple):
     alpha: Tensor | None
     mask: Tensor | None
 
+    @staticmethod
+    def of(camera: Camera, rgb: Tensor, alpha: Tensor | None = None, mask: Tensor | None = None) -> Target:
+        """The photo with the matrices of its camera."""
+        viewmat, K = (torch.as_tensor(matrix, dtype=torch.float32) for matrix in (camera.viewmat, camera.K))
+        return Target(camera, viewmat, K, rgb.contiguous(), alpha, mask)
+
     def over(self, background: Tensor) -> Tensor:
         """The photo uint8 [H, W, 3] over an RGB `background` [3] in 0 to 1."""
         return self.rgb if self.alpha is None else over(self.rgb, self.alpha, background)
@@ -74,7 +80,7 @@ class TrainingView:
         """
         mask = None if photo.mask is None or photo.mask.all() else torch.from_numpy(photo.mask)
         alpha = None if photo.alpha is None or (photo.alpha == 255).all() else torch.from_numpy(photo.alpha)
-        target = _target(normalization.camera(photo.camera), torch.from_numpy(photo.rgb), alpha, mask)
+        target = Target.of(normalization.camera(photo.camera), torch.from_numpy(photo.rgb), alpha, mask)
         return TrainingView(photo.view.name, {1: target}, files)
 
     @property
@@ -133,12 +139,6 @@ class TrainingView:
         return plane if self.files is None else torch.from_numpy(self.files.placed(plane.numpy()))
 
 
-def _target(camera: Camera, rgb: Tensor, alpha: Tensor | None, mask: Tensor | None) -> Target:
-    viewmat = torch.as_tensor(camera.viewmat, dtype=torch.float32)
-    intrinsics = torch.as_tensor(camera.K, dtype=torch.float32)
-    return Target(camera, viewmat, intrinsics, rgb.contiguous(), alpha, mask)
-
-
 def _reduced(full: Target, factor: int) -> Target:
     height, width = full.rgb.shape[:2]
     size = (max(1, round(height / factor)), max(1, round(width / factor)))
@@ -159,4 +159,4 @@ def _reduced(full: Target, factor: int) -> Target:
     if full.mask is not None:
         mask = area(full.mask[None].float())[0] >= 0.5
     pixels = (rgb.clamp(0.0, 255.0) + 0.5).to(torch.uint8).permute(1, 2, 0)
-    return _target(full.camera.scaled_to(size[1], size[0]), pixels, alpha, mask)
+    return Target.of(full.camera.scaled_to(size[1], size[0]), pixels, alpha, mask)

@@ -9,21 +9,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from splatmill.files import atomic_write
-from splatmill_worker.scene import Camera
 from splatmill_worker.splat.gaussians import Gaussians
-from splatmill_worker.splat.plan.light import Light
 from splatmill_worker.splat.plan.plan import Plan
-from splatmill_worker.splat.train.loop import Trained
+from splatmill_worker.splat.report.report import plain
+from splatmill_worker.splat.views import TrainingView
 from splatmill_worker.tiles.cells import Cell
+from splatmill_worker.tiles.photo_file import read_photos, write_photos
 
-Float = npt.NDArray[np.float64]
-
-GAUSSIANS, PHOTOS, FACTS = "gaussians.npz", "photos.npz", "coarse.json"
+GAUSSIANS, FACTS, TRAINING, HELD_OUT = "gaussians.npz", "coarse.json", "training", "held-out"
 
 
 @dataclass(frozen=True)
@@ -35,8 +32,9 @@ class Coarse:
     cells: of the tiles.
     most: the largest number of Gaussians of the whole scene.
     steps: of its training.
-    viewmats: world-to-camera matrices [4, 4] of the training photos as the training left them, by name.
-    departures: logarithm of the exposure [3] of the training photos, by name; empty where their light stays as it is.
+    views: the training photos, in the light and with the cameras that the training left them.
+    held_out: the photos that were not trained on.
+    facts: what was measured before the training (`Facts.as_dict`).
     """
 
     gaussians: Gaussians
@@ -44,52 +42,26 @@ class Coarse:
     cells: tuple[Cell, ...]
     most: int
     steps: int
-    viewmats: dict[str, Float]
-    departures: dict[str, Float]
-
-    @staticmethod
-    def of(trained: Trained, plan: Plan, cells: list[Cell], most: int, light: Light | None) -> Coarse:
-        """The model of a training run. light: of its photos, in their order; None where it stays as it is."""
-        names = [view.name for view in trained.views]
-        departures = {} if light is None else dict(zip(names, light.departures, strict=True))
-        return Coarse(
-            trained.gaussians.padded(3),
-            plan,
-            tuple(cells),
-            most,
-            trained.steps,
-            {view.name: view.full.camera.viewmat for view in trained.views},
-            departures,
-        )
+    views: tuple[TrainingView, ...]
+    held_out: tuple[TrainingView, ...]
+    facts: dict[str, Any]
 
     @cached_property
     def far(self) -> Tensor:
         """Which of the Gaussians no tile trains, bool [N] (see `far`)."""
         return far(self.gaussians, self.plan)
 
-    def corrected(self, name: str, camera: Camera) -> Camera:
-        """The camera of a training photo as the coarse training left it."""
-        return Camera(
-            camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, self.viewmats[name]
-        )
-
     def write(self, folder: Path) -> None:
         """Write the files into `folder`."""
         write_gaussians(folder, self.gaussians)
-        names = list(self.viewmats)
-        with (folder / PHOTOS).open("wb") as file:
-            np.savez(
-                file,
-                names=np.array(names),
-                viewmats=np.array([self.viewmats[name] for name in names]),
-                lit=np.array(list(self.departures), dtype=str),
-                departures=np.array(list(self.departures.values()), np.float64).reshape(-1, 3),
-            )
+        write_photos(folder / TRAINING, self.views)
+        write_photos(folder / HELD_OUT, self.held_out)
         document = {
             "plan": self.plan.as_dict(whole=True),
             "cells": [cell.as_dict() for cell in self.cells],
             "most": self.most,
             "steps": self.steps,
+            "facts": plain(self.facts),
         }
         atomic_write(folder / FACTS, json.dumps(document, indent=1))
 
@@ -112,17 +84,15 @@ def far(gaussians: Gaussians, plan: Plan) -> Tensor:
 def read(folder: Path) -> Coarse:
     """The model that `Coarse.write` left in `folder`. Raises OSError, ValueError or KeyError for other files."""
     document: dict[str, Any] = json.loads((folder / FACTS).read_text("utf-8"))
-    with np.load(folder / PHOTOS, allow_pickle=False) as photos:
-        viewmats = dict(zip(photos["names"].tolist(), photos["viewmats"], strict=True))
-        departures = dict(zip(photos["lit"].tolist(), photos["departures"], strict=True))
     return Coarse(
         read_gaussians(folder),
         Plan.from_dict(document["plan"]),
         tuple(Cell.from_dict(values) for values in document["cells"]),
         int(document["most"]),
         int(document["steps"]),
-        viewmats,
-        departures,
+        read_photos(folder / TRAINING),
+        read_photos(folder / HELD_OUT),
+        document["facts"],
     )
 
 

@@ -10,8 +10,9 @@ import subprocess
 import sys
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -25,6 +26,7 @@ from splatmill.schema import (
 )
 from splatmill.schema.quantities import listed
 from splatmill_worker.errors import Cancelled, Refusal, WorkerError
+from splatmill_worker.memory import return_freed
 from splatmill_worker.tiles.folder import SCENE, Claimed, PlanFolder, digest_of, facts_of
 from splatmill_worker.tiles.retrying import may_pass
 from splatmill_worker.tiles.units import ScenePlan
@@ -62,9 +64,23 @@ def make_plan(root: Path, capture: Path, options: str) -> int:
         shutil.rmtree(capture, ignore_errors=True)
 
 
-def do_unit(root: Path, name: str | None) -> int:
-    """Do the unit `name`, or all that can be done until none is left; returns the exit status."""
-    return _reported(lambda: _do_all(root) if name is None else _do_one(root, name))
+def do_units(root: Path, names: Sequence[str]) -> int:
+    """Do the units `names` one after the other, or all that can be done until none is left; returns the exit status.
+
+    Of several, those are left out that other processes do or have done, and the status is the first that is not 0.
+    """
+    if not names:
+        return _reported(lambda: _do_all(root))
+    first = 0
+    for name in names:
+        if len(names) > 1 and _is_taken(PlanFolder.open(root), name):
+            continue
+        status = _reported(partial(_do_one, root, name))
+        first = first or status
+        if status in (UNWRITABLE, STOPPED, BROKEN):
+            break
+        return_freed()
+    return first
 
 
 def list_units(root: Path, *, as_json: bool) -> int:
@@ -116,9 +132,6 @@ def _make_plan(root: Path, capture: Path, options: TrainOptions) -> int:
 
 def _do_one(root: Path, name: str) -> int:
     """Do one unit in this process."""
-    from splatmill_worker.images.decoding import decoders
-    from splatmill_worker.tiles.stages import Context, run_unit
-
     folder = PlanFolder.open(root)
     try:
         folder.plan.unit(name)
@@ -149,6 +162,11 @@ def _do_one(root: Path, name: str) -> int:
         with folder.claimed(name) as run:
             if _is_done(folder, name):  # by a process that was faster
                 return 0
+            # Short units end before their first line of progress, and libraries take seconds to be loaded.
+            print(f"{name}: begins", flush=True)
+            from splatmill_worker.images.decoding import decoders
+            from splatmill_worker.tiles.stages import Context, run_unit
+
             try:
                 context = Context(folder, run, _Lines(name), lambda: stopped.asked or not run.held())
                 readable = [folder.capture.resolve(), run.work.resolve()]
@@ -177,6 +195,13 @@ def _do_one(root: Path, name: str) -> int:
     return 0
 
 
+def _is_taken(folder: PlanFolder, name: str) -> bool:
+    """Whether the unit has ended, or another process runs it."""
+    states = folder.states()
+    known = any(unit.name == name for unit in folder.plan.units)
+    return known and (name in states or folder.running(name, states) is not None)
+
+
 def _is_done(folder: PlanFolder, name: str) -> bool:
     """Whether the unit is done, which is printed; the scene is linked then."""
     ended = folder.ended().get(name)
@@ -189,7 +214,7 @@ def _is_done(folder: PlanFolder, name: str) -> bool:
 
 
 def _do_all(root: Path) -> int:
-    """Do units, each in a process of its own, until the scene is done or nothing can be done any more."""
+    """Do units until the scene is done or nothing can be done any more, all that are ready in one process of theirs."""
     folder = PlanFolder.open(root)
     stopped = _StopSignals()
     attempts: dict[str, int] = {}
@@ -204,16 +229,18 @@ def _do_all(root: Path) -> int:
         free = [name for name in ready if folder.running(name, states) is None]
         if not free:
             time.sleep(POLL_SECONDS)
-        for name in free[:1]:
-            status = _in_process(root, name, stopped)
+        else:
+            status = _in_process(root, free, stopped)
             if stopped.asked:
                 raise KeyboardInterrupt
             if status == UNWRITABLE:
                 return status
-            if status not in (0, CLAIMED):
-                attempts[name] = attempts.get(name, 0) + 1
-                if attempts[name] >= MOST_ATTEMPTS:
-                    _give_up(folder, name, status)
+            states = folder.states()
+            left = [name for name in free if name not in states and folder.running(name, states) is None]
+            if status not in (0, CLAIMED) and left:  # they are done in order: the first one was not
+                attempts[left[0]] = attempts.get(left[0], 0) + 1
+                if attempts[left[0]] >= MOST_ATTEMPTS:
+                    _give_up(folder, left[0], status)
         if stopped.asked:
             raise KeyboardInterrupt
     print(_table(_rows(folder)))
@@ -225,11 +252,9 @@ def _do_all(root: Path) -> int:
     return 0
 
 
-def _in_process(root: Path, name: str, stopped: _StopSignals) -> int:
-    """Do one unit in a process of its own, which gives all memory back; its exit status, negative for a signal."""
-    # Short units end before their first line of progress, and a process takes seconds to load its libraries.
-    print(f"{name}: begins", flush=True)
-    child = subprocess.Popen([sys.executable, "-m", "splatmill_worker", "unit", str(root), name])
+def _in_process(root: Path, names: Sequence[str], stopped: _StopSignals) -> int:
+    """Do units in a process of their own, which gives all memory back; its exit status, negative for a signal."""
+    child = subprocess.Popen([sys.executable, "-m", "splatmill_worker", "unit", str(root), *names])
     while True:
         try:
             return child.wait(timeout=SIGNAL_SECONDS)

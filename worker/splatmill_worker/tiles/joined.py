@@ -15,8 +15,6 @@ from splatmill_worker.pipeline.cameras import Cameras, recover_cameras
 from splatmill_worker.pipeline.events import TrainingEvents
 from splatmill_worker.pipeline.files import write_files
 from splatmill_worker.pipeline.job import Job
-from splatmill_worker.pipeline.photos import Photos
-from splatmill_worker.pipeline.planning import plan_training, planned_photos
 from splatmill_worker.pipeline.stage_times import Stages
 from splatmill_worker.pipeline.training import Recording
 from splatmill_worker.splat.engine.open import open_engine
@@ -27,11 +25,10 @@ from splatmill_worker.splat.lpips import Distances
 from splatmill_worker.splat.machine import resident_memory
 from splatmill_worker.splat.plan.evaluated import finally_evaluated
 from splatmill_worker.splat.plan.plan import Plan
-from splatmill_worker.splat.plan.plan_file import write_plan
+from splatmill_worker.splat.report.report import PlannedScene
 from splatmill_worker.splat.train.curve import CurvePoint
 from splatmill_worker.splat.train.loop import Trained
 from splatmill_worker.splat.train.renderer import evaluation_background, renderer
-from splatmill_worker.splat.views import TrainingView
 from splatmill_worker.tiles.coarse_model import Coarse, read_gaussians
 from splatmill_worker.tiles.seams import Seams
 
@@ -114,16 +111,13 @@ def write_scene(joining: Joining) -> dict[str, Any]:
     """Write the files that a training of the whole scene writes; returns figures by name."""
     job, stages, coarse = joining.job, joining.stages, joining.coarse
     cameras = known_cameras(job, stages)
-    write_plan(job.workdir / "plan.json", job.options, coarse.plan)
-    planned = plan_training(job, cameras, lambda plan: plan, stages)
-    photos = _corrected(planned_photos(job, cameras, planned, stages), coarse)
-    planned = replace(planned, plan=_stated(joining))
     engine = open_engine(joining.gaussians(), job.kernels)
-    trained = _trained(joining, engine, photos)
-    record = Recording(TrainingEvents(job.emit, job.workdir, coarse.plan, photos.shown), None, None)
+    events = TrainingEvents(job.emit, job.workdir, coarse.plan, (coarse.held_out or coarse.views)[0])
+    trained = _trained(joining, engine, events)
     for sentence in joining.failures:
-        record.events.warn(sentence)
-    write_files(job, cameras, planned, photos, engine, trained, record, stages)
+        events.warn(sentence)
+    scene = PlannedScene(cameras.scene, coarse.facts, _stated(joining), coarse.held_out)
+    write_files(job, cameras, scene, engine, trained, Recording(events, None, None), stages)
     held_out = trained.held_out
     return {
         "gaussians": engine.count,
@@ -132,23 +126,13 @@ def write_scene(joining: Joining) -> dict[str, Any]:
         "psnr": None if held_out is None else held_out.psnr,
         "ssim": None if held_out is None else held_out.ssim,
         "failed": [number for number, tile in enumerate(joining.tiles, 1) if tile.path is None],
-        "seams": _seams(joining, engine, photos),
+        "seams": _seams(coarse, engine),
     }
 
 
 def known_cameras(job: Job, stages: Stages) -> Cameras:
     """The cameras that the unit `cameras` has found. What there is to be said of them was said there."""
     return recover_cameras(replace(job, emit=lambda event: None), stages)
-
-
-def _corrected(photos: Photos, coarse: Coarse) -> Photos:
-    """The photos, with those of the training as the coarse training left their cameras."""
-    views = []
-    for view in photos.training:
-        camera = coarse.corrected(view.name, view.full.camera)
-        viewmat = torch.as_tensor(camera.viewmat, dtype=torch.float32)
-        views.append(replace(view, levels={1: view.full._replace(camera=camera, viewmat=viewmat)}))
-    return replace(photos, training=tuple(views))
 
 
 def _stated(joining: Joining) -> Plan:
@@ -166,11 +150,11 @@ def _stated(joining: Joining) -> Plan:
     )
 
 
-def _trained(joining: Joining, engine: Engine, photos: Photos) -> Trained:
+def _trained(joining: Joining, engine: Engine, events: TrainingEvents) -> Trained:
     """The scene as the result of one training, whose curve is that of the coarse training and a last point."""
     plan = joining.coarse.plan
     with joining.stages.measured("evaluate"):
-        held_out, on_training = _scores(joining.job, engine, plan, photos)
+        held_out, on_training = _scores(joining.coarse, engine, events)
     curve = tuple(CurvePoint(**point) for point in joining.facts["curve"])
     last = CurvePoint(
         seconds=joining.seconds,
@@ -195,37 +179,30 @@ def _trained(joining: Joining, engine: Engine, photos: Photos) -> Trained:
         stopped=f"{len(joining.tiles)} tiles were trained",
         failure=None,
         recoveries=0,
-        views=photos.training,
+        views=joining.coarse.views,
         cameras_moved=joining.facts["cameras_moved"],
     )
 
 
-def _scores(job: Job, engine: Engine, plan: Plan, photos: Photos) -> tuple[Score | None, Score]:
-    render, background = renderer(engine, plan), evaluation_background(plan, photos.training)
-    distances = Distances.read() if plan.lpips and photos.held_out else None
-    events = TrainingEvents(job.emit, job.workdir, plan, photos.shown)
-    done = iter(range(1, len(photos.held_out) + 1))
-    held_out = (
-        evaluate(
-            render,
-            photos.held_out,
-            background,
-            distances,
-            lambda: events.evaluating(next(done), len(photos.held_out)),
-        )
-        if photos.held_out
-        else None
+def _scores(coarse: Coarse, engine: Engine, events: TrainingEvents) -> tuple[Score | None, Score]:
+    plan, views = coarse.plan, coarse.held_out
+    render, background = renderer(engine, plan), evaluation_background(plan, coarse.views)
+    on_training = evaluate(render, finally_evaluated(coarse.views), background)
+    if not views:
+        return None, on_training
+    done = iter(range(1, len(views) + 1))
+    distances = Distances.read() if plan.lpips else None
+    return (
+        evaluate(render, views, background, distances, lambda: events.evaluating(next(done), len(views))),
+        on_training,
     )
-    return held_out, evaluate(render, finally_evaluated(photos.training), background)
 
 
-def _seams(joining: Joining, engine: Engine, photos: Photos) -> dict[str, Any] | None:
+def _seams(coarse: Coarse, engine: Engine) -> dict[str, Any] | None:
     """How the held-out photos are shown where two tiles meet; None without such photos or with one tile."""
-    views: Sequence[TrainingView] = photos.held_out
-    if not views or len(joining.coarse.cells) < 2:
+    if not coarse.held_out or len(coarse.cells) < 2:
         return None
-    means = joining.coarse.gaussians.means.double().numpy()
-    near = ~joining.coarse.far
-    members: list[Tensor] = [torch.from_numpy(cell.holds(means)) & near for cell in joining.coarse.cells]
-    seams = Seams(joining.coarse.gaussians, members, joining.coarse.plan)
-    return asdict(seams.measured(engine, views))
+    means = coarse.gaussians.means.double().numpy()
+    near = ~coarse.far
+    members: list[Tensor] = [torch.from_numpy(cell.holds(means)) & near for cell in coarse.cells]
+    return asdict(Seams(coarse.gaussians, members, coarse.plan).measured(engine, coarse.held_out))

@@ -69,17 +69,18 @@ class Context:
     kept: Path | None = None
 
     def job(self, options: TrainOptions) -> Job:
-        """A job in the work folder of the unit, which has the recovered cameras there are.
+        """A job in the work folder of the unit, which has the recovered cameras there are; those of tiles need none.
 
         The coarse model alone is trained by the kernels of the options; the others run on machines with a GPU and
         without. Raises Refusal where those kernels do not run here.
         """
         work = self.run.work
         work.joinpath("out").mkdir(exist_ok=True)
-        cameras = self.folder.ended().get("cameras")
-        known = self.known if cameras is None or cameras.path is None else cameras.path / SFM
-        if known is not None and known.is_dir():
-            shutil.copytree(known, work / SFM, dirs_exist_ok=True)
+        if self.run.name not in self.folder.plan.part_names:
+            cameras = self.folder.ended().get("cameras")
+            known = self.known if cameras is None or cameras.path is None else cameras.path / SFM
+            if known is not None and known.is_dir():
+                shutil.copytree(known, work / SFM, dirs_exist_ok=True)
         if self.kept is not None:
             checkpoints, plan = self.kept / CHECKPOINTS, self.kept / PLAN_FILE
             checkpoints.mkdir(exist_ok=True)
@@ -161,8 +162,16 @@ def _coarse(context: Context, stages: Stages) -> dict[str, Any]:
     near = ~coarse_model.far(trained.gaussians, decided)
     weights = trained.gaussians.logit_opacities[near].double().sigmoid().numpy()
     cells = divide(trained.gaussians.means[near].double().numpy(), weights, plan.tiles)
-    light = planned.facts.light if decided.exposure else None
-    coarse_model.Coarse.of(trained, decided, cells, most, light).write(context.run.out)
+    coarse_model.Coarse(
+        trained.gaussians.padded(3),
+        decided,
+        tuple(cells),
+        most,
+        trained.steps,
+        tuple(trained.views),
+        photos.held_out,
+        planned.facts.as_dict(),
+    ).write(context.run.out)
     held_out = trained.held_out
     return {
         "gaussians": trained.gaussians.count,
@@ -186,7 +195,7 @@ def _tile(context: Context, stages: Stages) -> dict[str, Any]:
     ended = context.folder.ended()
     if last and ended[tile_name(number)].path is None:
         return {"gaussians": 0, "steps": 0, "photos": 0}  # the scene has the coarse model there
-    cameras, own = joined.known_cameras(job, stages), coarse.cells[number - 1]
+    own = coarse.cells[number - 1]
 
     def scene() -> tuple[Gaussians, Tensor]:
         if not last:
@@ -198,7 +207,7 @@ def _tile(context: Context, stages: Stages) -> dict[str, Any]:
         )
         return whole, torch.arange(whole.count) >= whole.count - int(coarse.far.sum())
 
-    result = train_tile(Tile(job, cameras, coarse, number - 1, scene, last), stages)
+    result = train_tile(Tile(job, coarse, number - 1, scene, last), stages)
     shutil.rmtree(context.run.out)
     context.run.out.mkdir()
     coarse_model.write_gaussians(context.run.out, result.gaussians)

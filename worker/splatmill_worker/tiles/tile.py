@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,16 +16,11 @@ from torch import Tensor
 
 from splatmill.schema import LogEvent, ProgressEvent
 from splatmill_worker import memory
-from splatmill_worker.images import look_ups
-from splatmill_worker.images.load import load_view, training_size
-from splatmill_worker.images.panoramas import divided_photos
 from splatmill_worker.images.pixel_files import PixelFiles
-from splatmill_worker.pipeline.cameras import Cameras
 from splatmill_worker.pipeline.job import Job
 from splatmill_worker.pipeline.photos import Room
 from splatmill_worker.pipeline.stage_times import Stages
 from splatmill_worker.pipeline.training import EXTENT
-from splatmill_worker.scene import View
 from splatmill_worker.sfm.callbacks import stop_if
 from splatmill_worker.splat.engine.open import open_engine
 from splatmill_worker.splat.gaussians import Gaussians
@@ -38,7 +32,7 @@ from splatmill_worker.splat.train.loop import Hooks, train
 from splatmill_worker.splat.train.observers import TrainingProgress
 from splatmill_worker.splat.views import TrainingView
 from splatmill_worker.tiles.coarse_model import Coarse
-from splatmill_worker.tiles.visibility import Part, parts
+from splatmill_worker.tiles.visibility import parts
 
 MARGIN = 0.05
 """Width of what is trained around a cell and then left to the tiles beside it, over the longest side of the box that
@@ -47,16 +41,12 @@ holds four fifths of the coarse model."""
 LAST = 0.2
 """Share of the steps of a tile that are taken beside the trained tiles around it (decisions: seams)."""
 
-LOADED = 8
-"""Photos that are loaded whole at a time; of each, only the part that shows the tile is kept."""
-
 
 @dataclass(frozen=True)
 class Tile:
     """A tile to train.
 
     job: the unit as a job.
-    cameras: of the photos.
     coarse: the coarse model.
     number: of the cell, from 0.
     scene: reads the Gaussians that its training starts from, of all cells, and which of them are far, bool [N]: these
@@ -65,7 +55,6 @@ class Tile:
     """
 
     job: Job
-    cameras: Cameras
     coarse: Coarse
     number: int
     scene: Callable[[], tuple[Gaussians, Tensor]]
@@ -126,6 +115,7 @@ def train_tile(tile: Tile, stages: Stages) -> TileResult:
             progress=progress,
             warn=lambda sentence: tile.job.emit(LogEvent(level="warning", message=sentence)),
             cancelled=tile.job.cancelled,
+            compares=False,
         ),
     )
     if trained.failure is not None:
@@ -166,7 +156,7 @@ def tile_plan(coarse: Coarse, free: int, photos: int, *, last: bool = False) -> 
     """
     plan, schedule = coarse.plan, coarse.plan.schedule
     until, boost = 1.0 - LAST, schedule.annealing.boost
-    share = photos / len(coarse.viewmats)
+    share = photos / len(coarse.views)
     total = max(2, round(share * coarse.steps))
     first = max(1, min(total - 1, round(until * total)))
     steps = total - first if last else first
@@ -199,7 +189,7 @@ def tile_plan(coarse: Coarse, free: int, photos: int, *, last: bool = False) -> 
             resolution=((0, 1),),
             densify_until=min(1.0, schedule.densify_until / until),
             annealing=annealing,
-            earlier_visits=coarse.steps / max(1, len(coarse.viewmats)) + (first / photos if last else 0.0),
+            earlier_visits=coarse.steps / max(1, len(coarse.views)) + (first / photos if last else 0.0),
         ),
     )
 
@@ -208,36 +198,19 @@ def _views(tile: Tile, whole: Gaussians, members: Tensor) -> Iterator[TrainingVi
     """The parts of the training photos that show the members, bool [N], of the scene `whole`, in files where memory is
     too small for them.
     """
-    coarse, cameras = tile.coarse, tile.cameras
-    size = coarse.plan.image_size
-    placed = []
-    for view in cameras.training:
+    coarse, room = tile.coarse, Room.of(tile.job)
+    cameras = [view.full.camera for view in coarse.views]
+    found = []
+    for view, part in zip(
+        coarse.views, parts(whole, members, cameras, antialias=coarse.plan.antialias), strict=True
+    ):
         stop_if(tile.job.cancelled)
-        camera = view.camera.scaled_to(*training_size(view.camera.width, view.camera.height, size))
-        placed.append(coarse.corrected(view.name, cameras.normalization.camera(camera)))
-    found = parts(whole, members, placed, antialias=coarse.plan.antialias)
-    chosen = [(view, part) for view, part in zip(cameras.training, found, strict=True) if part is not None]
-    room = Room.of(tile.job)
-    taken = BYTES_PER_PIXEL * sum(part.pixels for _, part in chosen)
+        if part is not None:
+            found.append((view, part))
+    taken = BYTES_PER_PIXEL * sum(part.pixels for _, part in found)
     files = None if fit_in_memory(taken, room.memory) else PixelFiles(room.folder)
-    with ThreadPoolExecutor(2) as pool:
-        for first in range(0, len(chosen), LOADED):
-            stop_if(tile.job.cancelled)
-            some = chosen[first : first + LOADED]
-            yield from pool.map(lambda each: _part_of(tile, each[0], each[1], size, files), some)
-            tile.job.emit(ProgressEvent(stage="loading", done=first + len(some), total=len(chosen)))
-    look_ups.forget()
-    divided_photos.forget()
-
-
-def _part_of(tile: Tile, view: View, part: Part, size: int, files: PixelFiles | None) -> TrainingView:
-    """The part of one photo, in the light and with the camera of the coarse training."""
-    photo = load_view(view, size)
-    whole = TrainingView.of(photo, tile.cameras.normalization)
-    if view.name in tile.coarse.departures:
-        whole = whole.relit(tile.coarse.departures[view.name])
-    target = whole.full
-    camera = tile.coarse.corrected(view.name, target.camera)
-    viewmat = torch.as_tensor(camera.viewmat, dtype=torch.float32)
-    shown = part.of(replace(whole, levels={1: target._replace(camera=camera, viewmat=viewmat)}))
-    return shown if files is None else shown.placed(files)
+    for done, (view, part) in enumerate(found, 1):
+        stop_if(tile.job.cancelled)
+        shown = part.of(view)
+        yield shown if files is None else shown.placed(files)
+        tile.job.emit(ProgressEvent(stage="loading", done=done, total=len(found)))

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from splatmill.schema import TrainOptions
 
-FORMAT = 4
+FORMAT = 5
 """Version of the plan's format and of what its units make: another one makes everything anew."""
 
 CAMERA_OPTIONS = ("sfm_effort", "matcher", "mapper", "max_video_frames", "scale", "seed", "start")
@@ -57,7 +57,7 @@ class ScenePlan:
 
     @cached_property
     def tile_names(self) -> tuple[str, ...]:
-        """The units that train the tiles. They need no other's output but those of the cameras and the coarse model."""
+        """The units that train the tiles. They need no other's output but that of the coarse model, and no photo."""
         return tuple(tile_name(number) for number in range(1, self.tiles + 1))
 
     @cached_property
@@ -74,13 +74,12 @@ class ScenePlan:
     def units(self) -> tuple[Unit, ...]:
         """All units, each after those that it needs."""
         tiles, seams = self.tile_names, self.seam_names
-        beside = ("cameras", "coarse", *tiles)
         return (
             Unit("cameras"),
             Unit("coarse", ("cameras",)),
-            *(Unit(name, ("cameras", "coarse")) for name in tiles),
-            *(Unit(name, beside, tiles) for name in seams),
-            Unit("scene", beside + seams, tiles + seams),
+            *(Unit(name, ("coarse",)) for name in tiles),
+            *(Unit(name, ("coarse", *tiles), tiles) for name in seams),
+            Unit("scene", ("cameras", "coarse", *tiles, *seams), tiles + seams),
         )
 
     def unit(self, name: str) -> Unit:
@@ -125,6 +124,11 @@ class ScenePlan:
             for need in unit.needs
             if states.get(need) != "done" and not (need in unit.optional and states.get(need) == "failed")
         ]
+
+    def before(self, name: str) -> set[str]:
+        """The units that end before the unit `name` can be run: those that it needs, and what these need."""
+        needs = self.unit(name).needs
+        return {*needs, *(unit for need in needs for unit in self.before(need))}
 
     def as_dict(self) -> dict[str, Any]:
         """The plan as JSON has it."""

@@ -54,10 +54,8 @@ class Part:
         full = view.full
         rows, columns = slice(self.top, self.bottom), slice(self.left, self.right)
         camera = full.camera.cropped(self.left, self.top, self.right - self.left, self.bottom - self.top)
-        target = Target(
+        target = Target.of(
             camera,
-            full.viewmat,
-            torch.as_tensor(camera.K, dtype=torch.float32),
             full.rgb[rows, columns].clone(),
             None if full.alpha is None else full.alpha[rows, columns].clone(),
             self.counted if full.mask is None else self.counted & full.mask[rows, columns],

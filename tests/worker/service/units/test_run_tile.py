@@ -17,15 +17,14 @@ import redis
 from splatmill.backplane.jobs.row import now
 from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import TrainOptions
-from splatmill_worker.service.job_folder import TileFolder
 from splatmill_worker.service.process_exit import WITHDRAWN_STATUS
 from splatmill_worker.service.units import run_tile as run_tile_module
 from splatmill_worker.service.units import stored_units
 from splatmill_worker.service.units.run_tile import TileEntry, run_tile
 from splatmill_worker.service.units.stored_units import StoredUnits
-from splatmill_worker.tiles.folder import PlanFolder, digest_of
+from splatmill_worker.tiles.folder import PlanFolder
 from splatmill_worker.tiles.units import ScenePlan
-from tests.support.jobs import CAPTURE, write_row
+from tests.support.jobs import write_row
 
 JOB = "job00001"
 
@@ -38,10 +37,7 @@ def entry(
     monkeypatch.setenv("SPLATMILL_STORAGE", (tmp_path / "storage").as_uri())
     options = TrainOptions(tiles=2)
     write_row(connection, JOB, options=options)
-    staged = TileFolder(local, JOB, CAPTURE)
-    staged.stage_capture()
-    plan = ScenePlan(digest_of(staged.capture), options)
-    staged.close()
+    plan = ScenePlan("d", options)
     made, units = PlanFolder(tmp_path / "made", plan), StoredUnits(local, JOB)
     units.put_plan(plan)
     for name in ("cameras", "coarse"):

@@ -63,7 +63,7 @@ def report_of(
     world = ExportWorld(Normalization(1.0, np.zeros(3)), np.array([100.0, 0.0, 0.0]))
     report = write_report(
         out,
-        PlannedScene(scene, measured, plan(20), held_out),
+        PlannedScene(scene, measured.as_dict(), plan(20), held_out),
         result,
         Exported(5, world),
         lambda target, _: torch.full((*target.rgb.shape[:2], 3), 0.5),

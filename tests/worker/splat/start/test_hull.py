@@ -66,14 +66,7 @@ def photo(camera: Camera, body: Body, color: tuple[int, int, int] = (200, 100, 5
     ends = camera.unproject(columns.ravel(), rows.ravel(), np.ones(rows.size))
     alpha = 255 * body(camera.center, ends - camera.center).reshape(rows.shape)
     rgb = np.broadcast_to(np.array(color, np.uint8), (*rows.shape, 3)).copy()
-    return Target(
-        camera,
-        torch.from_numpy(camera.viewmat).float(),
-        torch.from_numpy(camera.K).float(),
-        torch.from_numpy(rgb),
-        torch.from_numpy(alpha.astype(np.uint8)),
-        None,
-    )
+    return Target.of(camera, torch.from_numpy(rgb), torch.from_numpy(alpha.astype(np.uint8)))
 
 
 def photos(body: Body, count: int = 40) -> list[Target]:

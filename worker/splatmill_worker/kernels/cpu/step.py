@@ -132,9 +132,7 @@ class Step:
             self._rows, self._moved = len(ordered["means"]), (count + unused) // blocks.LANES
             order = self._order_with_context(ordered["means"], count, count + unused)
             exp_avg, exp_avg_sq = (
-                None
-                if moment is None
-                else torch.cat([moment, moment.new_zeros(self._rows - count, PARAMETERS)])
+                None if moment is None else torch.cat([moment, moment.new_zeros(unused, PARAMETERS)])
                 for moment in (exp_avg, exp_avg_sq)
             )
         self._order = order
@@ -142,7 +140,8 @@ class Step:
         for name, moment in (("exp_avg", exp_avg), ("exp_avg_sq", exp_avg_sq)):
             self.__dict__.pop(name, None)
             if moment is not None:
-                setattr(self, name, blocks.pack_rows(moment, self.threads, order))
+                own = None if order is None else order[: len(moment)]
+                setattr(self, name, blocks.pack_rows(moment, self.threads, own))
         self._clusters = engine.Clusters(*self._state, self._rows, self.threads) if self.clustered else None
         self._scores = torch.zeros(3, len(self.blocks) * blocks.LANES)
         self._rendered = False
@@ -160,7 +159,7 @@ class Step:
     def parameters(self) -> dict[str, Tensor]:
         """Return copies of the parameters, [N, ...] each, under the names of the constructor."""
         self._settle()
-        n = self._rows
+        n = self.count
         shapes = {
             "means": (n, 3),
             "log_scales": (n, 3),
@@ -169,14 +168,13 @@ class Step:
             "sh": (n, 16, 3),
         }
         sizes = {k: torch.Size(s) for k, s in shapes.items()}
-        groups = blocks.unpack(self.blocks, sizes, n, self.threads, self._order)
-        return groups if self._context is None else {k: v[: self.count].clone() for k, v in groups.items()}
+        return blocks.unpack(self.blocks, sizes, n, self.threads, self._own_order)
 
     def moments(self) -> tuple[Tensor, Tensor]:
         """Return copies of Adam's first and second moments, [N, 59] each; columns in the order of `records.GROUPS`."""
         self._settle()
         first, second = (
-            blocks.unpack_rows(rows, self._rows, self.threads, self._order)[: self.count]
+            blocks.unpack_rows(rows, self.count, self.threads, self._own_order)
             for rows in (self.exp_avg, self.exp_avg_sq)
         )
         return first, second
@@ -184,12 +182,22 @@ class Step:
     @cached_property
     def exp_avg(self) -> Tensor:
         """The first moments: zeros, made when they are first used, since an engine that only renders needs none."""
-        return blocks.empty(self._rows)
+        return blocks.empty(self._moving)
 
     @cached_property
     def exp_avg_sq(self) -> Tensor:
         """The second moments: zeros, made when they are first used."""
-        return blocks.empty(self._rows)
+        return blocks.empty(self._moving)
+
+    @property
+    def _moving(self) -> int:
+        """Number of the first rows, which have moments: all but those of the context."""
+        return self._rows if self._moved is None else self._moved * blocks.LANES
+
+    @property
+    def _own_order(self) -> Tensor | None:
+        """The order of the rows without those of the context."""
+        return None if self._order is None else self._order[: self.count]
 
     @property
     def share_computed(self) -> float:

@@ -1,4 +1,4 @@
-"""A tile of a job that another worker has: staged, trained and stored, in a process of its own (see `rq_worker`)."""
+"""A tile of a job that another worker has: trained and stored, in a process of its own (see `rq_worker`)."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from splatmill.backplane.storage.storage import Storage
 from splatmill_worker.errors import WorkerError
 from splatmill_worker.service import hand_back
 from splatmill_worker.service.disk_reserve import DiskWatch
-from splatmill_worker.service.job_folder import ENDED, TileFolder
+from splatmill_worker.service.job_folder import TileFolder
 from splatmill_worker.service.process_exit import HANDED_BACK_STATUS, WITHDRAWN_STATUS
 from splatmill_worker.service.redis_patience import patiently
 from splatmill_worker.service.units.stored_units import StoredUnits
 from splatmill_worker.settings import storage_url
-from splatmill_worker.tiles.folder import PlanFolder, digest_of
+from splatmill_worker.tiles.folder import PlanFolder
 
 POLL_SECONDS = 0.5
 """Seconds between two questions whether the job still runs."""
@@ -91,21 +91,15 @@ def _train(entry: TileEntry, row: JobRow, stopped: Callable[[], bool]) -> None:
     folder = TileFolder(storage, entry.job_id, row.capture)
     try:
         folder.run.mkdir(parents=True, exist_ok=True)
-        folder.stage_capture()
-        if digest_of(folder.capture) != plan.digest:
-            log.warning("the photos of the job %s have changed since its plan was made", entry.job_id)
-            return
         tiles = PlanFolder(folder.run, plan)
-        tiles.place(folder.capture)
         tiles.release()
-        units.bring(tiles, only=(*plan.unit(name).needs, name))
+        units.bring(tiles, only=(*plan.before(name), name), check=folder.check_space)
         if name in tiles.states() or tiles.plan.missing(name, tiles.states()):
             return
-        # Not imported by the worker that forks this process: numpy and the decoders start threads.
-        from splatmill_worker.images.decoding import decoders
+        # Not imported by the worker that forks this process: numpy and torch start threads.
         from splatmill_worker.tiles.stages import Context, run_unit
 
-        with decoders.confined([folder.path], folder.run / ENDED, stopped), tiles.claimed(name) as run:
+        with tiles.claimed(name) as run:
             run_unit(Context(tiles, run, lambda event: None, stopped))
         units.put(run.path)
     finally:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from splatmill import __version__
@@ -68,10 +68,16 @@ class StoredUnits:
             if self._storage.exists(stored) and self._storage.get(stored) != (ended.path / DONE).read_bytes():
                 shutil.rmtree(ended.path)
 
-    def bring(self, folder: PlanFolder, only: Sequence[str] | None = None) -> list[tuple[str, int]]:
+    def bring(
+        self,
+        folder: PlanFolder,
+        only: Sequence[str] | None = None,
+        check: Callable[[Mapping[Path, Entry]], None] = lambda wanted: None,
+    ) -> list[tuple[str, int]]:
         """Copy the outputs that the folder of the plan lacks into it. Return the names and sizes of their files.
 
         only: names of the units whose outputs are wanted; None: all.
+        check: called with the files of an output and where they will be, before these are copied.
         """
         wanted: dict[str, dict[str, Entry]] = defaultdict(dict)
         for entry in self._storage.entries(self._prefix):
@@ -86,7 +92,9 @@ class StoredUnits:
                 continue  # it is being stored
             part = folder.root / UNITS / f".{output}.part"
             shutil.rmtree(part, ignore_errors=True)
-            staging.fetch(self._storage, {part / name: entry for name, entry in files.items()})
+            copies = {part / name: entry for name, entry in files.items()}
+            check(copies)
+            staging.fetch(self._storage, copies)
             part.rename(folder.root / UNITS / output)
             brought += [(f"{output}/{name}", entry.size) for name, entry in files.items()]
         return brought

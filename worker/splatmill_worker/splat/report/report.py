@@ -19,7 +19,6 @@ from splatmill.schema.quantities import listed
 from splatmill_worker.scene import Scene
 from splatmill_worker.splat.evaluate import Renderer, Score
 from splatmill_worker.splat.machine import machine, peak_memory, versions
-from splatmill_worker.splat.plan.facts import Facts
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.report import disagreeing, page
 from splatmill_worker.splat.report.export import Exported
@@ -50,13 +49,13 @@ class PlannedScene:
     """The scene that was trained, and what was measured and decided before.
 
     scene: the cameras and points in the world that they came in, and the photos without a camera.
-    facts: what was measured before training.
+    facts: what was measured before training (`Facts.as_dict`).
     plan: what was decided from it.
     held_out: the views that were not trained on.
     """
 
     scene: Scene
-    facts: Facts
+    facts: Mapping[str, Any]
     plan: Plan
     held_out: Sequence[TrainingView]
 
@@ -116,7 +115,7 @@ def write_report(
             ],
             "misfits": _misfits(trained),
             "warnings": warnings,
-            "facts": planned.facts.as_dict(),
+            "facts": planned.facts,
             "sfm": planned.scene.facts,
             "frame": _frame(planned.scene.frame),
             "time_lapse": time_lapse,

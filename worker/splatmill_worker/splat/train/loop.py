@@ -43,6 +43,7 @@ class Hooks:
     checkpoint: with a snapshot to store, now and then (`Checkpoints`) and on a cancellation; None: never.
     checkpoint_seconds: seconds between two checkpoints, at most.
     observers: others that observe the run.
+    compares: whether the photos are compared, for `Trained.disagreements`.
     """
 
     progress: Callable[[TrainingProgress], None] = lambda _: None
@@ -53,6 +54,7 @@ class Hooks:
     checkpoint: Callable[[Snapshot], None] | None = None
     checkpoint_seconds: float = CHECKPOINT_SECONDS
     observers: Sequence[Observer] = ()
+    compares: bool = True
 
 
 @dataclass(frozen=True)
@@ -73,6 +75,7 @@ class Trained:
     cameras_moved: median correction of the cameras, pixels; None where they are not refined.
     validation: names of the training views that were set aside for decisions.
     disagreements: how far each training photo disagrees with those around it, the largest first; without `validation`.
+        Empty where they are not compared.
     """
 
     gaussians: Gaussians
@@ -120,8 +123,11 @@ def train(
     if resume_from is not None:
         run.resume(resume_from)
     validation = tuple(run.views[index].name for index in sorted(run.set_aside))
-    evaluations, look = Evaluations(run, held_out, hooks.evaluated, hooks.evaluating), Look(run)
-    observers: list[Observer] = [ProgressReports(hooks.progress), evaluations, look, *hooks.observers]
+    evaluations = Evaluations(run, held_out, hooks.evaluated, hooks.evaluating)
+    look = Look(run) if hooks.compares else None
+    observers: list[Observer] = [ProgressReports(hooks.progress), evaluations, *hooks.observers]
+    if look is not None:
+        observers.append(look)
     if hooks.checkpoint is not None:
         observers.append(Checkpoints(hooks.checkpoint, hooks.checkpoint_seconds))
     failure = None
@@ -162,7 +168,7 @@ def _advance(run: TrainingRun) -> TrainingFailed | None:
 def _result(
     run: TrainingRun,
     evaluations: Evaluations,
-    look: Look,
+    look: Look | None,
     failure: TrainingFailed | None,
     validation: tuple[str, ...],
 ) -> Trained:
@@ -172,7 +178,7 @@ def _result(
     if failure is not None:
         evaluations.final = None
     final = evaluations.finish()
-    found = look.finish()
+    disagreements = () if look is None else look.finish()
     return Trained(
         gaussians=gaussians_of(run.engine).padded(run.plan.schedule.degree),
         curve=run.state.curve,
@@ -180,12 +186,12 @@ def _result(
         on_training=final.on_training,
         steps=run.state.step,
         seconds=seconds,
-        evaluate_seconds=evaluations.seconds + look.seconds,
+        evaluate_seconds=evaluations.seconds + (0.0 if look is None else look.seconds),
         stopped=run.stopped if failure is None else f"{failure}",
         failure=failure,
         recoveries=run.state.recoveries,
         views=corrected(run),
         cameras_moved=None if run.poses is None else run.poses.pixels_moved(),
         validation=validation,
-        disagreements=found,
+        disagreements=disagreements,
     )

@@ -34,20 +34,21 @@ SPLATMILL_INLINE Float pull(const BlockState& at, int r) {
 }
 
 // Means that are NaN are left out: their Gaussians are never drawn.
-Box measured(const State& state, int64_t cluster, int64_t count) {
+Box measured(const State& state, int64_t cluster, int64_t count, bool moves) {
   constexpr float kInfinite = std::numeric_limits<float>::infinity();
   Float low[3], high[3], log_scale = splat(-kInfinite), mean_pull = splat(0.0f), scale_pull = splat(0.0f);
   for (int j = 0; j < 3; ++j) low[j] = splat(kInfinite), high[j] = splat(-kInfinite);
   const int64_t end = std::min(blocks_for(count), (cluster + 1) * kClusterBlocks);
   for (int64_t b = cluster * kClusterBlocks; b < end; ++b) {
     const float* p = state.params + b * kParameterFloats;
-    const BlockState at(state, b);
     const Mask used = mask_of(lanes_of(b, count));
     for (int j = 0; j < 3; ++j) {
       const Float x = row(p, kMean + j);
       low[j] = min(select(used, x, low[j]), low[j]);
       high[j] = max(select(used, x, high[j]), high[j]);
       log_scale = max(select(used, row(p, kLogScale + j), log_scale), log_scale);
+      if (!moves) continue;
+      const BlockState at(state, b);
       mean_pull = max(keep(used, pull(at, kMean + j)), mean_pull);
       scale_pull = max(keep(used, pull(at, kLogScale + j)), scale_pull);
     }
@@ -134,13 +135,14 @@ void Drift::add(const Sums& rates, int64_t step, double beta2) {
   travel_.push_back(Sums{});
 }
 
-Clusters::Clusters(const State& state, int64_t count, int threads)
+Clusters::Clusters(const State& state, int64_t count, int64_t moved, int threads)
     : count_(count),
+      moving_((moved + kClusterBlocks - 1) / kClusterBlocks),
       boxes_((blocks_for(count) + kClusterBlocks - 1) / kClusterBlocks),
       current_(boxes_.size(), 0),
       near_(boxes_.size(), 0) {
 #pragma omp parallel for schedule(static) num_threads(threads)
-  for (int64_t c = 0; c < size(); ++c) boxes_[c] = measured(state, c, count_);
+  for (int64_t c = 0; c < size(); ++c) boxes_[c] = measured(state, c, count_, c < moving_);
 }
 
 void Clusters::choose(const State& state, const Camera& camera, int threads) {
@@ -155,7 +157,8 @@ void Clusters::choose(const State& state, const Camera& camera, int threads) {
   {
     const FlushDenormals flush;
 #pragma omp for schedule(dynamic, 1)
-    for (int64_t i = 0; i < chosen; ++i) catch_up(state, chosen_[i]);
+    for (int64_t i = 0; i < chosen; ++i)
+      if (chosen_[i] < moving_) catch_up(state, chosen_[i]);
   }
 }
 
@@ -164,7 +167,7 @@ void Clusters::settle(const State& state, int threads) {
   {
     const FlushDenormals flush;
 #pragma omp for schedule(dynamic, 1)
-    for (int64_t c = 0; c < size(); ++c) catch_up(state, c);
+    for (int64_t c = 0; c < moving(); ++c) catch_up(state, c);
   }
 }
 
@@ -189,7 +192,7 @@ void Clusters::catch_up(const State& state, int64_t cluster) {
     }
   }
   current_[cluster] = drift_.updates();
-  boxes_[cluster] = measured(state, cluster, count_);
+  boxes_[cluster] = measured(state, cluster, count_, true);
 }
 
 void Clusters::advance(const State& state, const Drift::Sums& rates, int64_t step, double beta2, int rows, int threads) {
@@ -199,8 +202,9 @@ void Clusters::advance(const State& state, const Drift::Sums& rates, int64_t ste
 }
 
 void Clusters::moved(const State& state, int64_t cluster) {
+  if (cluster >= moving_) return;
   current_[cluster] = drift_.updates();
-  boxes_[cluster] = measured(state, cluster, count_);
+  boxes_[cluster] = measured(state, cluster, count_, true);
 }
 
 Visited::Visited(int64_t count, const Clusters* clusters) : blocks_(blocks_for(count)) {
@@ -217,9 +221,11 @@ void bind_clusters(nb::module_& m) {
       .def(
           "__init__",
           [](Clusters* self, Blocks params, Blocks exp_avg, Blocks exp_avg_sq, int64_t count, int threads) {
-            new (self) Clusters({params.data(), exp_avg.data(), exp_avg_sq.data()}, count, threads);
+            const auto moved = static_cast<int64_t>(exp_avg.shape(0));
+            new (self) Clusters({params.data(), exp_avg.data(), exp_avg_sq.data()}, count, moved, threads);
           },
-          "params"_a.noconvert(), "exp_avg"_a.noconvert(), "exp_avg_sq"_a.noconvert(), "count"_a, "threads"_a)
+          "params"_a.noconvert(), "exp_avg"_a.noconvert(), "exp_avg_sq"_a.noconvert(), "count"_a, "threads"_a,
+          "Of the Gaussians in blocks of which the first ones have moments, and move.")
       .def(
           "choose",
           [](Clusters& self, Blocks params, Blocks exp_avg, Blocks exp_avg_sq, const Camera& camera, int threads) {

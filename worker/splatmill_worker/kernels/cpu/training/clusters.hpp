@@ -3,6 +3,7 @@
 // the scene is read.
 #pragma once
 
+#include <algorithm>
 #include <array>
 #include <vector>
 
@@ -42,7 +43,8 @@ class Drift {
 
 class Clusters {
  public:
-  Clusters(const State& state, int64_t count, int threads);
+  // Only the blocks before number `moved`, a multiple of kClusterBlocks, have moments: the others stay where they are.
+  Clusters(const State& state, int64_t count, int64_t moved, int threads);
 
   // Chooses the clusters that `camera` may show, and brings them up to date.
   void choose(const State& state, const Camera& camera, int threads);
@@ -60,8 +62,10 @@ class Clusters {
 
  private:
   void catch_up(const State& state, int64_t cluster);
+  int64_t moving() const { return std::min(size(), moving_); }
 
-  int64_t count_;  // Gaussians
+  int64_t count_;   // Gaussians
+  int64_t moving_;  // clusters that move: the first ones
   std::vector<Box> boxes_;
   std::vector<int64_t> current_;  // the update after which each box was measured, and its cluster is as it was
   std::vector<int32_t> chosen_;   // ascending
