@@ -6,15 +6,18 @@ The truth is a scene of all Gaussians, in which those of the context are put bac
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
 from splatmill_worker.kernels.cpu.step import Step
+from splatmill_worker.kernels.records import PartOf
 from splatmill_worker.splat.engine.autograd import AutogradEngine
 from splatmill_worker.splat.engine.open import open_engine
 from splatmill_worker.splat.gaussians import Gaussians
+from splatmill_worker.splat.plan.plan import Kernels
 from tests.kernels.cpu.test_cpu_clusters import HEIGHT, NAMES, RATES, WIDTH, K, camera, street
 
 SCORES = ("plain_sum", "visible_count", "max_extent")
@@ -142,3 +145,28 @@ def test_what_a_context_excludes_is_refused() -> None:
         open_engine(Gaussians(*groups), "gpu", context=Gaussians(*groups))
     with pytest.raises(ValueError, match="means"):
         Step(*groups, context={**named(groups, apart), "means": torch.zeros(3, 2)})
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+def test_a_part_of_a_photo_is_trained_as_the_photo_is(backend: Kernels) -> None:
+    groups, _ = scene(160)
+    left, top, right, bottom = 16, 8, 48, 32
+    whole_photo, mask = photo(1), torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    mask[top:bottom, left:right] = True
+    shifted = K.clone()
+    shifted[:2, 2] -= torch.tensor([left, top])
+    gaussians = Gaussians(**dict(zip(NAMES, groups, strict=True)))
+    whole, part, apart = (open_engine(gaussians, backend) for _ in range(3))
+    used = int(mask.sum())
+    common: dict[str, Any] = {"degree": 3, "rates": RATES, "step": 1, "background": BACKGROUND}
+    wanted = whole.train_photo(camera(20.0), K, whole_photo, mask=mask, **common)
+    cut = whole_photo[top:bottom, left:right].contiguous()
+    seen = part.train_photo(camera(20.0), shifted, cut, part_of=PartOf(WIDTH, HEIGHT, used), **common)
+    apart.train_photo(camera(20.0), shifted, cut, part_of=PartOf(WIDTH, HEIGHT, 4 * used), **common)
+    assert seen.loss == pytest.approx(wanted.loss, rel=1e-5)
+    shown = part.visible_count > 0  # outside of the part, the photo shows others
+    torch.testing.assert_close(part.plain_sum[shown], whole.plain_sum[shown], rtol=1e-3, atol=1e-8)
+    torch.testing.assert_close(part.max_extent[shown], whole.max_extent[shown], rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(apart.plain_sum, part.plain_sum / 4, rtol=1e-5, atol=1e-10)
+    for name, value in part.parameters().items():
+        torch.testing.assert_close(value[shown], whole.parameters()[name][shown], rtol=1e-4, atol=1e-4)

@@ -123,6 +123,27 @@ class StepResult(NamedTuple):
     refused: int
 
 
+class PartOf(NamedTuple):
+    """The photo that a photo is a part of.
+
+    width, height: in pixels.
+    used: number of its pixels that are trained on.
+    """
+
+    width: int
+    height: int
+    used: int
+
+    def reduced(self, factor: int) -> PartOf:
+        """The same of the photo with both sides divided by `factor`."""
+        return PartOf(
+            *(
+                max(1, round(size / over))
+                for size, over in zip(self, (factor, factor, factor**2), strict=True)
+            )
+        )
+
+
 @dataclass(frozen=True)
 class Rates:
     """Adam's learning rate of each parameter group, and its factor on the second moments.

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from splatmill_worker.images.load import Photo
 from splatmill_worker.images.pixel_files import PixelFiles
+from splatmill_worker.kernels.records import PartOf
 from splatmill_worker.scene import Camera, Normalization
 
 Float = npt.NDArray[np.float64]
@@ -32,6 +33,7 @@ class Target(NamedTuple):
     rgb: uint8 [H, W, 3].
     alpha: uint8 [H, W]; None where the photo is opaque.
     mask: bool [H, W], true at the pixels that count; None where all do.
+    part_of: the photo that this one is a part of; None where it is whole.
     """
 
     camera: Camera
@@ -40,6 +42,7 @@ class Target(NamedTuple):
     rgb: Tensor
     alpha: Tensor | None
     mask: Tensor | None
+    part_of: PartOf | None = None
 
     @staticmethod
     def of(camera: Camera, rgb: Tensor, alpha: Tensor | None = None, mask: Tensor | None = None) -> Target:
@@ -159,4 +162,5 @@ def _reduced(full: Target, factor: int) -> Target:
     if full.mask is not None:
         mask = area(full.mask[None].float())[0] >= 0.5
     pixels = (rgb.clamp(0.0, 255.0) + 0.5).to(torch.uint8).permute(1, 2, 0)
-    return Target.of(full.camera.scaled_to(size[1], size[0]), pixels, alpha, mask)
+    reduced = Target.of(full.camera.scaled_to(size[1], size[0]), pixels, alpha, mask)
+    return reduced if full.part_of is None else reduced._replace(part_of=full.part_of.reduced(factor))

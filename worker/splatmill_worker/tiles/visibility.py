@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from splatmill_worker.kernels.records import PartOf
 from splatmill_worker.scene import Camera
 from splatmill_worker.splat.engine.cpu import CpuEngine
 from splatmill_worker.splat.gaussians import SH_C0, Gaussians
@@ -60,7 +61,9 @@ class Part:
             None if full.alpha is None else full.alpha[rows, columns].clone(),
             self.counted if full.mask is None else self.counted & full.mask[rows, columns],
         )
-        return TrainingView(view.name, {1: target})
+        height, width = full.rgb.shape[:2]
+        used = height * width if full.mask is None else int(full.mask.sum())
+        return TrainingView(view.name, {1: target._replace(part_of=PartOf(width, height, used))})
 
 
 def parts(

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from splatmill_worker.kernels import checks
-from splatmill_worker.kernels.records import PARAMETERS, TILE, Rates, StepResult, Waves
+from splatmill_worker.kernels.records import PARAMETERS, TILE, PartOf, Rates, StepResult, Waves
 
 from ..morton import morton_order
 from . import blocks, engine
@@ -317,11 +317,13 @@ class Step:
         antialias: bool = False,
         near: float = 0.01,
         pose_gradient: bool = False,
+        part_of: PartOf | None = None,
     ) -> StepResult:
         """Take one step on one photo: render, L1 + D-SSIM, gradients, scores, Adam.
 
         photo uint8 [H,W,3] and mask [H,W], nonzero where a pixel is used; or photo_stats, which `loss.photo_stats`
         makes of both at the cost of the loss itself. step counts from 1. pose_gradient as in `backward_update`.
+        part_of: the photo that this one is a part of: gradients and scores are then those that the part has in it.
         """
         stats = _stats(photo, mask) if photo_stats is None else photo_stats
         height, width = stats.pixels.shape[1], stats.width
@@ -339,7 +341,9 @@ class Step:
             self._gradient,
             self.threads,
         )
-        refused = self._update(self._gradient, rates, step, pose_gradient)
+        if part_of is not None:
+            self._gradient.mul_(stats.weight / part_of.used)
+        refused = self._update(self._gradient, rates, step, pose_gradient, part_of)
         total = (1 - dssim_weight) * l1 + dssim_weight * (1 - ssim)
         return StepResult(total, l1, ssim, *self.visibility, refused)
 
@@ -402,7 +406,14 @@ class Step:
                 gradient[i].zero_()
         return gradient
 
-    def _update(self, gradient: Tensor, rates: Rates, step: int, pose_gradient: bool) -> int:
+    def _update(
+        self,
+        gradient: Tensor,
+        rates: Rates,
+        step: int,
+        pose_gradient: bool,
+        part_of: PartOf | None = None,
+    ) -> int:
         if step < 1:
             raise ValueError(f"step: counts from 1, got {step}")
         if pose_gradient and self._context is not None:
@@ -426,6 +437,7 @@ class Step:
             self._clusters,
             self.wave_gradient,
             self._moved,
+            None if part_of is None else (part_of.width, part_of.height),
         )
         self._rendered = False  # the rendering shows the Gaussians before they moved
         return refused

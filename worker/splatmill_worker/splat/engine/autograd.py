@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from splatmill_worker.kernels import ops
-from splatmill_worker.kernels.records import BETA1, EPS, Rates
+from splatmill_worker.kernels.records import BETA1, EPS, PartOf, Rates
 from splatmill_worker.splat.engine.protocol import StepResult
 from splatmill_worker.splat.gaussians import Gaussians, concatenate
 from splatmill_worker.splat.motion import motion
@@ -115,6 +115,7 @@ class AutogradEngine:
         *,
         rates: Rates,
         step: int,
+        part_of: PartOf | None = None,
     ) -> None:
         if self._pending is None:
             raise RuntimeError("backward_update needs a forward pass before it.")
@@ -126,7 +127,7 @@ class AutogradEngine:
         ]
         torch.autograd.backward([out for out, _ in wanted], [grad for _, grad in wanted])
         height, width = outputs[0].shape[:2]
-        self._score(projected, width, height)
+        self._score(projected, *((width, height) if part_of is None else part_of[:2]))
         twist = None if self._twist is None else self._twist.grad
         self.pose_gradient = None if twist is None else twist.float()
         self._adam(rates, step)
@@ -146,6 +147,7 @@ class AutogradEngine:
         mask: Tensor | None = None,
         antialias: bool = False,
         key: Hashable | None = None,
+        part_of: PartOf | None = None,
     ) -> StepResult:
         height, width = photo.shape[:2]
         self.forward(viewmat, K, width, height, degree=degree, background=background, antialias=antialias)
@@ -156,7 +158,10 @@ class AutogradEngine:
         loss = ops.loss(color, photo, mask=mask, backend=BACKEND)
         (gradient,) = torch.autograd.grad(loss, color)
         visible = int((self._pending[0].extents[:, 0] > 0).sum())
-        self.backward_update(gradient, rates=rates, step=step)
+        if part_of is not None:
+            used = photo[..., 0].numel() if mask is None else int(mask.count_nonzero())
+            gradient = gradient * (used / part_of.used)
+        self.backward_update(gradient, rates=rates, step=step, part_of=part_of)
         return StepResult(float(loss.detach()), visible)
 
     def _score(self, projected: ops.Projected, width: int, height: int) -> None:

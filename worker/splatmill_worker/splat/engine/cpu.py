@@ -8,7 +8,7 @@ from torch import Tensor
 
 from splatmill_worker.kernels.cpu.loss import STATISTICS_PER_PIXEL, PhotoStats, photo_stats
 from splatmill_worker.kernels.cpu.step import Step
-from splatmill_worker.kernels.records import Rates
+from splatmill_worker.kernels.records import PartOf, Rates
 from splatmill_worker.splat.engine.protocol import StepResult
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.views import over
@@ -70,6 +70,7 @@ class CpuEngine(Step):
         mask: Tensor | None = None,
         antialias: bool = False,
         key: Hashable | None = None,
+        part_of: PartOf | None = None,
     ) -> StepResult:
         seen = self.train(
             viewmat,
@@ -84,6 +85,7 @@ class CpuEngine(Step):
             else photo_stats(over(photo, alpha, background), mask=mask),
             antialias=antialias,
             pose_gradient=self.keep_pose_gradient,
+            part_of=part_of,
         )
         return StepResult(seen.loss, seen.visible)
 

@@ -7,7 +7,7 @@ from collections.abc import Hashable
 from torch import Tensor
 
 from splatmill_worker.kernels.gpu.step import Step
-from splatmill_worker.kernels.records import Rates
+from splatmill_worker.kernels.records import PartOf, Rates
 from splatmill_worker.splat.engine.protocol import StepResult
 from splatmill_worker.splat.gaussians import Gaussians
 
@@ -37,11 +37,14 @@ class GpuEngine(Step):
         mask: Tensor | None = None,
         antialias: bool = False,
         key: Hashable | None = None,
+        part_of: PartOf | None = None,
     ) -> StepResult:
         """Enqueue one step; the result is that of the latest step whose numbers have reached the host.
 
         `key` is not used: what is kept of a photo is kept with its tensor.
         """
+        if part_of is not None:
+            raise ValueError("part_of: the gpu engine trains on whole photos")
         seen = self.train(
             viewmat, K, photo, degree=degree, rates=rates, step=step, background=background, alpha=alpha, mask=mask,
             antialias=antialias,

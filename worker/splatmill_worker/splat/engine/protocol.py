@@ -7,7 +7,7 @@ from typing import NamedTuple, Protocol
 
 from torch import Tensor
 
-from splatmill_worker.kernels.records import Rates
+from splatmill_worker.kernels.records import PartOf, Rates
 
 
 class StepResult(NamedTuple):
@@ -101,6 +101,7 @@ class Engine(Protocol):
         mask: Tensor | None = None,
         antialias: bool = False,
         key: Hashable | None = None,
+        part_of: PartOf | None = None,
     ) -> StepResult:
         """Take one step on `photo` uint8 [H, W, 3]: render, loss over the pixels of `mask` [H, W], gradients, Adam.
 
@@ -112,4 +113,6 @@ class Engine(Protocol):
         antialias: compensate opacities for the dilation of small Gaussians.
         key: names the photo and its mask; the same key always comes with the same two, so work on them may be kept.
             Nobody writes into the tensors of photos, alphas and masks that were given.
+        part_of: the photo that this one is a part of. The gradients are then those that the part has in the loss of
+            that photo, and the scores count in its NDC units, so that a part is trained as the whole is. Not for gpu.
         """

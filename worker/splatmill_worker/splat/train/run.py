@@ -271,6 +271,7 @@ class TrainingRun:
                     mask=target.mask,
                     antialias=self.plan.antialias,
                     key=(index, self.reduction),
+                    part_of=target.part_of,
                 )
         except MemoryError as short:
             raise TrainingFailed(FailureName.memory, f"{short}", step=self.state.step) from short

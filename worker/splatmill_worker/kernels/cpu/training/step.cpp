@@ -41,6 +41,7 @@ struct Update {
   float* gradients = nullptr;
   float* scores = nullptr;  // [kScoreRows][score_stride]; null where none are kept
   int64_t score_stride = 0;
+  float photo_width = 0, photo_height = 0;  // of the whole photo that scores refer to, pixels
 };
 
 // Adds up the pair sums of a block in the order of the pairs: lane l of sums[k] is sum k of Gaussian l.
@@ -75,9 +76,8 @@ SPLATMILL_INLINE ProjectedGradient gradient_from_sums(const Float* s, const Proj
   return d;
 }
 
-SPLATMILL_INLINE void add_scores(const Update& update, const Camera& cam, int64_t b, const Projection& o,
-                                 const ProjectedGradient& d, Mask visible) {
-  const float half_w = 0.5f * cam.width, half_h = 0.5f * cam.height;
+SPLATMILL_INLINE void add_scores(const Update& update, int64_t b, const Projection& o, const ProjectedGradient& d, Mask visible) {
+  const float half_w = 0.5f * update.photo_width, half_h = 0.5f * update.photo_height;
   const auto length = [&](Float x, Float y) {
     x = x * half_w, y = y * half_h;
     return sqrt(fma(x, x, y * y));
@@ -86,7 +86,7 @@ SPLATMILL_INLINE void add_scores(const Update& update, const Camera& cam, int64_
   const auto at = [&](Score k) { return score + k * update.score_stride; };
   store(at(kPlain), visible, load(at(kPlain)) + length(d.x2d, d.y2d));
   store(at(kSeen), visible, load(at(kSeen)) + 1.0f);
-  const float per_image = 2.0f / static_cast<float>(std::max(cam.width, cam.height));
+  const float per_image = 2.0f / std::max(update.photo_width, update.photo_height);
   store(at(kExtent), visible, max(max(o.extent_x, o.extent_y) * per_image, load(at(kExtent))));
 }
 
@@ -106,7 +106,7 @@ int64_t update_block(const Frame& frame, const ImageGradient& g, const Scene& sc
     Projection o;
     project_geometry(p, frame.camera, o);
     const ProjectedGradient d = gradient_from_sums(sums, o);
-    if (update.scores) add_scores(update, frame.camera, b, o, d, visible);
+    if (update.scores) add_scores(update, b, o, d, visible);
     CameraGradient camera;
     project_backward<kPose>(p, frame.camera, scene.degree, o, d, gradient, &camera);
     if constexpr (kPose) add_camera_gradient(camera, visible, pose);
@@ -206,7 +206,8 @@ void bind_step(nb::module_& m) {
       "update",
       [](Frame& frame, Blocks params, Blocks exp_avg, Blocks exp_avg_sq, int degree, Image image, Image gradient,
          const std::vector<float>& rates, double beta2, int64_t step, std::optional<ScoreRows> scores, int threads,
-         std::optional<Twist> pose, Clusters* clusters, std::optional<Rows<kWaveFloats>> d_waves, std::optional<int64_t> moved) {
+         std::optional<Twist> pose, Clusters* clusters, std::optional<Rows<kWaveFloats>> d_waves, std::optional<int64_t> moved,
+         std::optional<std::tuple<int, int>> photo) {
         Update update;
         update.state = {params.data(), exp_avg.data(), exp_avg_sq.data()};
         update.adam = AdamStep(step, beta2);
@@ -214,6 +215,8 @@ void bind_step(nb::module_& m) {
         update.step = step;
         const ImageGradient g{planes_of(image, frame.camera), planes_of(gradient, frame.camera), gradient.shape(0) == 5};
         if (scores) update.scores = scores->data(), update.score_stride = static_cast<int64_t>(scores->shape(1));
+        const auto [width, height] = photo.value_or(std::tuple(frame.camera.width, frame.camera.height));
+        update.photo_width = static_cast<float>(width), update.photo_height = static_cast<float>(height);
         nb::gil_scoped_release release;
         Stopwatch watch;
         composite_backward(frame, g, threads);
@@ -241,9 +244,11 @@ void bind_step(nb::module_& m) {
       "image"_a.noconvert(), "gradient"_a.noconvert(), "rates"_a, "beta2"_a, "step"_a,
       "scores"_a.noconvert().none(), "threads"_a, "pose"_a.noconvert().none() = nb::none(), "clusters"_a.none() = nb::none(),
       "d_waves"_a.noconvert().none() = nb::none(), "moved"_a.none() = nb::none(),
+      "photo"_a.none() = nb::none(),
       "Backward pass of the last render and one Adam step; returns how many gradient values were refused as not finite. Adds to "
       "`scores` [3, Gaussians] and fills `pose` [6] with the gradient to a motion of the camera (pose.hpp), where given. With "
-      "`clusters`, which `render` was given too, moves those chosen last. With `moved`, only blocks before that number are moved.");
+      "`clusters`, which `render` was given too, moves those chosen last. With `moved`, only blocks before that number are moved. `photo` is the width and "
+      "height of the whole photo that the image is a part of, which scores refer to.");
   m.def(
       "gradients",
       [](Frame& frame, Blocks params, int degree, Image image, Image gradient, Blocks gradients, int threads) {
