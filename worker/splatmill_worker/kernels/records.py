@@ -124,7 +124,7 @@ class StepResult(NamedTuple):
 
 
 class PartOf(NamedTuple):
-    """The photo that a photo is a part of.
+    """The photo that a photo is a part of (decisions: photo-parts).
 
     width, height: in pixels.
     used: number of its pixels that are trained on.
