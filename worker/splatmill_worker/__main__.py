@@ -90,6 +90,7 @@ def main(argv: list[str] | None = None) -> int:
     unit = programs.add_parser("unit", help="do some units of a plan, or all that are left")
     unit.add_argument("folder", type=Path)
     unit.add_argument("names", nargs="*")
+    unit.add_argument("--begun", type=int, help="descriptor for the names of the units that begin")
     units = programs.add_parser("units", help="list the units of a plan")
     units.add_argument("folder", type=Path)
     units.add_argument("--json", action="store_true", help="print one JSON document instead of lines")
@@ -151,7 +152,7 @@ def main(argv: list[str] | None = None) -> int:
         if chosen.program == "plan":
             return command.make_plan(chosen.folder, chosen.capture, chosen.options)
         if chosen.program == "unit":
-            return command.do_units(chosen.folder, chosen.names)
+            return command.do_units(chosen.folder, chosen.names, chosen.begun)
         return command.list_units(chosen.folder, as_json=chosen.json)
     if chosen.program == "doctor":
         from splatmill_worker.doctor import report

@@ -153,6 +153,7 @@ def test_a_part_of_a_photo_is_trained_as_the_photo_is(backend: Kernels) -> None:
     left, top, right, bottom = 16, 8, 48, 32
     whole_photo, mask = photo(1), torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
     mask[top:bottom, left:right] = True
+    mask[20:24, 30:40] = False
     shifted = K.clone()
     shifted[:2, 2] -= torch.tensor([left, top])
     gaussians = Gaussians(**dict(zip(NAMES, groups, strict=True)))
@@ -160,13 +161,17 @@ def test_a_part_of_a_photo_is_trained_as_the_photo_is(backend: Kernels) -> None:
     used = int(mask.sum())
     common: dict[str, Any] = {"degree": 3, "rates": RATES, "step": 1, "background": BACKGROUND}
     wanted = whole.train_photo(camera(20.0), K, whole_photo, mask=mask, **common)
-    cut = whole_photo[top:bottom, left:right].contiguous()
-    seen = part.train_photo(camera(20.0), shifted, cut, part_of=PartOf(WIDTH, HEIGHT, used), **common)
-    apart.train_photo(camera(20.0), shifted, cut, part_of=PartOf(WIDTH, HEIGHT, 4 * used), **common)
+    cut, cut_mask = (each[top:bottom, left:right].contiguous() for each in (whole_photo, mask))
+    for engine, counted in ((part, used), (apart, 4 * used)):
+        of = PartOf(WIDTH, HEIGHT, counted)
+        seen = engine.train_photo(camera(20.0), shifted, cut, mask=cut_mask, part_of=of, **common)
     assert seen.loss == pytest.approx(wanted.loss, rel=1e-5)
     shown = part.visible_count > 0  # outside of the part, the photo shows others
     torch.testing.assert_close(part.plain_sum[shown], whole.plain_sum[shown], rtol=1e-3, atol=1e-8)
     torch.testing.assert_close(part.max_extent[shown], whole.max_extent[shown], rtol=1e-4, atol=1e-6)
     torch.testing.assert_close(apart.plain_sum, part.plain_sum / 4, rtol=1e-5, atol=1e-10)
+    for first, other, factor in zip(part.moments(), apart.moments(), (4, 16), strict=True):
+        torch.testing.assert_close(factor * other, first, rtol=1e-4, atol=1e-12)
+    torch.testing.assert_close(part.moments()[0][shown], whole.moments()[0][shown], rtol=1e-3, atol=1e-7)
     for name, value in part.parameters().items():
         torch.testing.assert_close(value[shown], whole.parameters()[name][shown], rtol=1e-4, atol=1e-4)

@@ -304,6 +304,44 @@ def test_a_capture_without_cameras_fails_once_and_says_why(tmp_path: Path) -> No
     assert "coarse     waiting   needs cameras" in text
 
 
+def test_a_unit_that_ends_its_process_is_given_up_and_the_others_are_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By a program in place of Python that publishes units at once, and ends with the second tile."""
+    root, fake = tmp_path / "plan", tmp_path / "python"
+    capture = still_life.posed_capture(tmp_path / "capture")
+    assert command.make_plan(root, capture, OPTIONS.model_dump_json()) == 0
+    fake.write_text(
+        f"""#!{sys.executable}
+import os, signal, sys
+from pathlib import Path
+from splatmill_worker.tiles.folder import PlanFolder
+at = sys.argv.index("--begun")
+begun, root, names = int(sys.argv[at + 1]), Path(sys.argv[at + 3]), sys.argv[at + 4:]
+for name in names:
+    with PlanFolder.open(root).claimed(name) as run:
+        os.write(begun, f"{{name}}\\n".encode())
+        with open(root / "log", "a") as log:
+            log.write(f"{{name}} ")
+        if name == "tile-2":
+            os.kill(os.getpid(), signal.SIGKILL)
+        run.out.mkdir()
+        run.publish({{"photos": 0}})
+""",
+        "utf-8",
+    )
+    fake.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(fake))
+    assert command.do_units(root, []) == 0
+    assert PlanFolder.open(root).states() == {
+        name: "failed" if name == "tile-2" else "done" for name in PlanFolder.open(root).states()
+    }
+    assert (root / "log").read_text().split() == [
+        *("cameras", "coarse", "tile-1", "tile-2", "tile-2", "tile-2", "seam-1", "seam-2", "scene"),
+    ]
+    assert "tile-2 was tried 3 times, and its process was killed" in capsys.readouterr().out
+
+
 def test_photos_that_are_links_are_planned(whole: Path, tmp_path: Path) -> None:
     photos = tmp_path / "photos"
     (photos / "images").mkdir(parents=True)

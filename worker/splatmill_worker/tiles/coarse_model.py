@@ -16,11 +16,13 @@ from splatmill.files import atomic_write
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.report.report import plain
+from splatmill_worker.splat.train.disagreement import Disagreement
 from splatmill_worker.splat.views import TrainingView
 from splatmill_worker.tiles.cells import Cell
 from splatmill_worker.tiles.photo_file import read_photos, write_photos
 
 GAUSSIANS, FACTS, TRAINING, HELD_OUT = "gaussians.npz", "coarse.json", "training", "held-out"
+OUTLIERS = "outliers.npz"
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,7 @@ class Coarse:
     views: the training photos, in the light and with the cameras that the training left them.
     held_out: the photos that were not trained on.
     facts: what was measured before the training (`Facts.as_dict`).
+    disagreements: how far the training photos disagree with one another.
     """
 
     gaussians: Gaussians
@@ -45,6 +48,7 @@ class Coarse:
     views: tuple[TrainingView, ...]
     held_out: tuple[TrainingView, ...]
     facts: dict[str, Any]
+    disagreements: tuple[Disagreement, ...]
 
     @cached_property
     def far(self) -> Tensor:
@@ -56,12 +60,15 @@ class Coarse:
         write_gaussians(folder, self.gaussians)
         write_photos(folder / TRAINING, self.views)
         write_photos(folder / HELD_OUT, self.held_out)
+        with (folder / OUTLIERS).open("wb") as file:
+            np.savez_compressed(file, *(each.outliers.numpy() for each in self.disagreements))
         document = {
             "plan": self.plan.as_dict(whole=True),
             "cells": [cell.as_dict() for cell in self.cells],
             "most": self.most,
             "steps": self.steps,
             "facts": plain(self.facts),
+            "disagreements": [each[:-1] for each in self.disagreements],
         }
         atomic_write(folder / FACTS, json.dumps(document, indent=1))
 
@@ -93,7 +100,16 @@ def read(folder: Path) -> Coarse:
         read_photos(folder / TRAINING),
         read_photos(folder / HELD_OUT),
         document["facts"],
+        _disagreements(folder, document["disagreements"]),
     )
+
+
+def _disagreements(folder: Path, rows: list[list[Any]]) -> tuple[Disagreement, ...]:
+    with np.load(folder / OUTLIERS, allow_pickle=False) as outliers:
+        return tuple(
+            Disagreement._make([*row, torch.from_numpy(outliers[f"arr_{index}"])])
+            for index, row in enumerate(rows)
+        )
 
 
 def write_gaussians(folder: Path, gaussians: Gaussians) -> None:

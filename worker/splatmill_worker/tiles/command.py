@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 import traceback
 from collections.abc import Callable, Sequence
@@ -64,21 +65,24 @@ def make_plan(root: Path, capture: Path, options: str) -> int:
         shutil.rmtree(capture, ignore_errors=True)
 
 
-def do_units(root: Path, names: Sequence[str]) -> int:
+def do_units(root: Path, names: Sequence[str], begun: int | None = None) -> int:
     """Do the units `names` one after the other, or all that can be done until none is left; returns the exit status.
 
-    Of several, those are left out that other processes do or have done, and the status is the first that is not 0.
+    Of several, those are left out that other processes do or have done. The status is that of the unit with which it
+    ends, or the first that is not 0.
+
+    begun: descriptor of a file to which the name of each unit is written when it begins, a line each.
     """
     if not names:
         return _reported(lambda: _do_all(root))
-    first = 0
+    first, stopped = 0, _StopSignals()
     for name in names:
-        if len(names) > 1 and _is_taken(PlanFolder.open(root), name):
-            continue
-        status = _reported(partial(_do_one, root, name))
-        first = first or status
+        status = _reported(partial(_do_one, root, name, stopped, begun, alone=len(names) == 1))
         if status in (UNWRITABLE, STOPPED, BROKEN):
-            break
+            return status
+        if stopped.asked:
+            return STOPPED
+        first = first or status
         return_freed()
     return first
 
@@ -130,8 +134,8 @@ def _make_plan(root: Path, capture: Path, options: TrainOptions) -> int:
     return 0
 
 
-def _do_one(root: Path, name: str) -> int:
-    """Do one unit in this process."""
+def _do_one(root: Path, name: str, stopped: _StopSignals, begun: int | None, *, alone: bool) -> int:
+    """Do one unit in this process. alone: it was asked for, so that what is in its way is an error."""
     folder = PlanFolder.open(root)
     try:
         folder.plan.unit(name)
@@ -140,6 +144,8 @@ def _do_one(root: Path, name: str) -> int:
         raise Refusal(
             "option_out_of_range", f"The plan has no unit {name!r}.", advice=f"Its units are {names}."
         ) from None
+    if not alone and _is_taken(folder, name):
+        return 0
     if _is_done(folder, name):
         return 0
     missing = folder.plan.missing(name, folder.states())
@@ -157,13 +163,14 @@ def _do_one(root: Path, name: str) -> int:
                 print(f"{other} is made without {name} by {by}; try again when it is done.", file=sys.stderr)
                 return CLAIMED
         folder.forget_failures(name)
-    stopped = _StopSignals()
     try:
         with folder.claimed(name) as run:
             if _is_done(folder, name):  # by a process that was faster
                 return 0
             # Short units end before their first line of progress, and libraries take seconds to be loaded.
             print(f"{name}: begins", flush=True)
+            if begun is not None:
+                os.write(begun, f"{name}\n".encode())
             from splatmill_worker.images.decoding import decoders
             from splatmill_worker.tiles.stages import Context, run_unit
 
@@ -198,8 +205,7 @@ def _do_one(root: Path, name: str) -> int:
 def _is_taken(folder: PlanFolder, name: str) -> bool:
     """Whether the unit has ended, or another process runs it."""
     states = folder.states()
-    known = any(unit.name == name for unit in folder.plan.units)
-    return known and (name in states or folder.running(name, states) is not None)
+    return name in states or folder.running(name, states) is not None
 
 
 def _is_done(folder: PlanFolder, name: str) -> bool:
@@ -230,17 +236,15 @@ def _do_all(root: Path) -> int:
         if not free:
             time.sleep(POLL_SECONDS)
         else:
-            status = _in_process(root, free, stopped)
+            status, last = _in_process(root, free, stopped)
             if stopped.asked:
                 raise KeyboardInterrupt
             if status == UNWRITABLE:
                 return status
-            states = folder.states()
-            left = [name for name in free if name not in states and folder.running(name, states) is None]
-            if status not in (0, CLAIMED) and left:  # they are done in order: the first one was not
-                attempts[left[0]] = attempts.get(left[0], 0) + 1
-                if attempts[left[0]] >= MOST_ATTEMPTS:
-                    _give_up(folder, left[0], status)
+            if status not in (0, CLAIMED) and last not in folder.states():
+                attempts[last] = attempts.get(last, 0) + 1
+                if attempts[last] >= MOST_ATTEMPTS:
+                    _give_up(folder, last, status)
         if stopped.asked:
             raise KeyboardInterrupt
     print(_table(_rows(folder)))
@@ -252,15 +256,27 @@ def _do_all(root: Path) -> int:
     return 0
 
 
-def _in_process(root: Path, names: Sequence[str], stopped: _StopSignals) -> int:
-    """Do units in a process of their own, which gives all memory back; its exit status, negative for a signal."""
-    child = subprocess.Popen([sys.executable, "-m", "splatmill_worker", "unit", str(root), *names])
-    while True:
-        try:
-            return child.wait(timeout=SIGNAL_SECONDS)
-        except subprocess.TimeoutExpired:
-            if stopped.asked:
-                child.send_signal(signal.SIGTERM)
+def _in_process(root: Path, names: Sequence[str], stopped: _StopSignals) -> tuple[int, str]:
+    """Do units in a process of their own, which gives all memory back; its exit status, negative for a signal, and the
+    unit that began last.
+    """
+    with tempfile.TemporaryFile() as begun:
+        child = subprocess.Popen(
+            [
+                *(sys.executable, "-m", "splatmill_worker", "unit", "--begun", str(begun.fileno())),
+                *("--", str(root), *names),
+            ],
+            pass_fds=[begun.fileno()],
+        )
+        while True:
+            try:
+                status = child.wait(timeout=SIGNAL_SECONDS)
+                break
+            except subprocess.TimeoutExpired:
+                if stopped.asked:
+                    child.send_signal(signal.SIGTERM)
+        begun.seek(0)
+        return status, [names[0], *begun.read().decode().split()][-1]
 
 
 def _give_up(folder: PlanFolder, name: str, status: int) -> None:

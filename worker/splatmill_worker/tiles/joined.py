@@ -181,6 +181,7 @@ def _trained(joining: Joining, engine: Engine, events: TrainingEvents) -> Traine
         recoveries=0,
         views=joining.coarse.views,
         cameras_moved=joining.facts["cameras_moved"],
+        disagreements=joining.coarse.disagreements,
     )
 
 

@@ -1,11 +1,12 @@
 """Photos as the coarse training has left them, in one file of which each tile reads its parts.
 
-They are decoded, undistorted, reduced and relit once, and not by every unit again.
+They are decoded, undistorted, reduced and brought to one light once, and not by every unit again.
 """
 
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -56,7 +57,7 @@ def read_photos(path: Path) -> tuple[TrainingView, ...]:
         )
     if not len(names):
         return ()
-    pixels = np.memmap(path.with_suffix(PIXELS), np.uint8, "c")  # torch wants memory that it may write to
+    pixels = np.memmap(path.with_suffix(PIXELS), np.uint8, "r")
     wanted = int((sizes.prod(axis=1) * (3 + planes.sum(axis=1))).sum())
     if len(pixels) != wanted:
         raise ValueError(f"{path.with_suffix(PIXELS)} has {len(pixels)} bytes; its photos have {wanted}.")
@@ -65,7 +66,11 @@ def read_photos(path: Path) -> tuple[TrainingView, ...]:
     def plane(*shape: int) -> Tensor:
         nonlocal begin
         begin += math.prod(shape)
-        return torch.from_numpy(pixels[begin - math.prod(shape) : begin].reshape(shape))
+        with warnings.catch_warnings():
+            warnings.filterwarnings(
+                "ignore", "The given NumPy array is not writable"
+            )  # nothing writes into photos
+            return torch.from_numpy(pixels[begin - math.prod(shape) : begin].reshape(shape))
 
     for name, (width, height), (fx, fy, cx, cy), viewmat, (has_alpha, has_mask) in zip(
         names.tolist(), sizes.tolist(), intrinsics.tolist(), viewmats, planes.tolist(), strict=True

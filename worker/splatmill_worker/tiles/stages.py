@@ -171,6 +171,7 @@ def _coarse(context: Context, stages: Stages) -> dict[str, Any]:
         tuple(trained.views),
         photos.held_out,
         planned.facts.as_dict(),
+        trained.disagreements,
     ).write(context.run.out)
     held_out = trained.held_out
     return {

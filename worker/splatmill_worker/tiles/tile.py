@@ -205,7 +205,7 @@ def _views(tile: Tile, whole: Gaussians, members: Tensor) -> Iterator[TrainingVi
         coarse.views, parts(whole, members, cameras, antialias=coarse.plan.antialias), strict=True
     ):
         stop_if(tile.job.cancelled)
-        if part is not None:
+        if part is not None and bool(part.counted_of(view).any()):
             found.append((view, part))
     taken = BYTES_PER_PIXEL * sum(part.pixels for _, part in found)
     files = None if fit_in_memory(taken, room.memory) else PixelFiles(room.folder)

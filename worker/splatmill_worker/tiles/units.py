@@ -22,7 +22,7 @@ State = Literal["done", "failed"]
 
 @dataclass(frozen=True)
 class Unit:
-    """A part of the work, done by one process.
+    """A part of the work, which no two processes share.
 
     name: unique in its plan.
     needs: names of the units whose output it reads.
@@ -57,7 +57,7 @@ class ScenePlan:
 
     @cached_property
     def tile_names(self) -> tuple[str, ...]:
-        """The units that train the tiles. They need no other's output but that of the coarse model, and no photo."""
+        """The units that train the tiles. They need the output of the coarse model alone, and not the capture."""
         return tuple(tile_name(number) for number in range(1, self.tiles + 1))
 
     @cached_property

@@ -50,16 +50,25 @@ class Part:
         """Number of pixels within the sides."""
         return self.counted.numel()
 
+    @property
+    def inside(self) -> tuple[slice, slice]:
+        """Its rows and columns of the photo."""
+        return slice(self.top, self.bottom), slice(self.left, self.right)
+
+    def counted_of(self, view: TrainingView) -> Tensor:
+        """The pixels that are trained on and that the mask of the photo has too, bool [bottom - top, right - left]."""
+        mask = view.full.mask
+        return self.counted if mask is None else self.counted & mask[self.inside]
+
     def of(self, view: TrainingView) -> TrainingView:
         """The part as a photo of its own, with a copy of its pixels."""
         full = view.full
-        rows, columns = slice(self.top, self.bottom), slice(self.left, self.right)
         camera = full.camera.cropped(self.left, self.top, self.right - self.left, self.bottom - self.top)
         target = Target.of(
             camera,
-            full.rgb[rows, columns].clone(),
-            None if full.alpha is None else full.alpha[rows, columns].clone(),
-            self.counted if full.mask is None else self.counted & full.mask[rows, columns],
+            full.rgb[self.inside].clone(),
+            None if full.alpha is None else full.alpha[self.inside].clone(),
+            self.counted_of(view),
         )
         height, width = full.rgb.shape[:2]
         used = height * width if full.mask is None else int(full.mask.sum())

@@ -17,6 +17,7 @@ import redis
 from splatmill.backplane.jobs.row import now
 from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import TrainOptions
+from splatmill_worker.service.job_folder import tile_folders
 from splatmill_worker.service.process_exit import WITHDRAWN_STATUS
 from splatmill_worker.service.units import run_tile as run_tile_module
 from splatmill_worker.service.units import stored_units
@@ -50,6 +51,8 @@ def entry(
 def test_an_error_of_the_system_is_for_the_queue_to_try_again(entry: TileEntry) -> None:
     with pytest.raises(FileNotFoundError, match="coarse"):
         run_tile(entry)
+    (folder,) = tile_folders(JOB)
+    assert sorted(path.name for path in folder.iterdir()) == ["lock", "run"], "the photos are not fetched"
 
 
 def test_a_failure_with_a_name_leaves_the_tile_to_the_attempt(

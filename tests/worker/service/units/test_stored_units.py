@@ -6,12 +6,13 @@ Does not prove what workers make of them: tests/service/test_tiles.py does.
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
 
 from splatmill.backplane.storage import layout
-from splatmill.backplane.storage.storage import Storage
+from splatmill.backplane.storage.storage import Entry, Storage
 from splatmill.schema import TrainOptions
 from splatmill_worker.service.units.stored_units import VERSION, StoredUnits
 from splatmill_worker.tiles.folder import DONE, PLAN, PlanFolder, facts_of
@@ -47,6 +48,23 @@ def there(tmp_path: Path) -> PlanFolder:
 def stored_of(storage: Storage) -> list[str]:
     prefix = layout.job_units(JOB)
     return sorted(entry.path.removeprefix(prefix + "/") for entry in storage.entries(prefix))
+
+
+def test_outputs_for_which_there_is_no_room_are_not_brought(
+    storage: Storage, here: PlanFolder, there: PlanFolder
+) -> None:
+    units, asked = StoredUnits(storage, JOB), list[int]()
+
+    def refuse(wanted: Mapping[Path, Entry]) -> None:
+        asked.append(sum(entry.size for entry in wanted.values()))
+        raise OSError("full")
+
+    units.put(here.output("cameras"))
+    with pytest.raises(OSError, match="full"):
+        units.bring(there, check=refuse)
+    assert asked == [3 + (here.output("cameras") / DONE).stat().st_size]
+    assert there.states() == {}
+    assert [name.partition("/")[2] for name, _ in units.bring(there)] == [DONE, "sfm/points"]
 
 
 def test_what_one_worker_did_is_found_by_another(

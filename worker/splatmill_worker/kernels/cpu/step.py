@@ -50,8 +50,8 @@ class Step:
         `replace`.
     wave_gradient: the loss's gradient [M, 6] to the values of the waves of the last `train` or `backward_update`.
     blocks, exp_avg, exp_avg_sq: parameters and moments, float32 [ceil(N/16), 59, 16] (`blocks`); with `clustered`, in
-        an order of their own, and without the steps missed. Those of a context stand behind the others, from a block,
-        or with `clustered` a cluster, of their own on.
+        an order of their own, and without the steps missed. Parameters of a context stand behind the others, from a
+        block, or with `clustered` a cluster, of their own on.
     """
 
     def __init__(

@@ -282,7 +282,7 @@ def _pipeline(attempt: Attempt, load: LoadPipeline, row: JobRow, folder: JobFold
     from splatmill_worker.service.units.other_workers import OtherWorkers
     from splatmill_worker.tiles import job
 
-    others = OtherWorkers(attempt.connection, attempt.job_id, attempt.generation, folder.storage, room)
+    others = OtherWorkers(attempt.connection, folder, attempt.generation, room)
     return partial(job.run, others=others)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import redis
 
 from splatmill.backplane.queue import queue
-from splatmill.backplane.storage.storage import Storage
+from splatmill_worker.service.job_folder import JobFolder
 from splatmill_worker.service.redis_patience import patiently
 from splatmill_worker.service.room import Room
 from splatmill_worker.service.units.stored_units import StoredUnits
@@ -23,12 +23,11 @@ class OtherWorkers:
     a worker that does not come, and no tile is done by two unless one of them is lost.
     """
 
-    def __init__(
-        self, connection: redis.Redis, job_id: str, generation: int, storage: Storage, room: Room
-    ) -> None:
-        self._connection, self._job_id, self._generation = connection, job_id, generation
-        self._room = room
-        self._units = StoredUnits(storage, job_id)
+    def __init__(self, connection: redis.Redis, folder: JobFolder, generation: int, room: Room) -> None:
+        """folder: of the job, on this machine."""
+        self._connection, self._job_id, self._generation = connection, folder.job_id, generation
+        self._room, self._job_folder = room, folder
+        self._units = StoredUnits(folder.storage, folder.job_id)
         self._numbers: dict[str, int] = {}
         self._offered: set[str] = set()
 
@@ -59,7 +58,7 @@ class OtherWorkers:
 
     def gather(self, folder: PlanFolder) -> None:
         """Bring the outputs of others into the folder of the plan, and count them for the owner of the job."""
-        for name, size in self._units.bring(folder):
+        for name, size in self._units.bring(folder, check=self._job_folder.check_space):
             self._room.store(name, size)
 
     def end(self) -> None:

@@ -125,9 +125,8 @@ def train(
     validation = tuple(run.views[index].name for index in sorted(run.set_aside))
     evaluations = Evaluations(run, held_out, hooks.evaluated, hooks.evaluating)
     look = Look(run) if hooks.compares else None
-    observers: list[Observer] = [ProgressReports(hooks.progress), evaluations, *hooks.observers]
-    if look is not None:
-        observers.append(look)
+    observers: list[Observer] = [ProgressReports(hooks.progress), evaluations]
+    observers += [*([] if look is None else [look]), *hooks.observers]
     if hooks.checkpoint is not None:
         observers.append(Checkpoints(hooks.checkpoint, hooks.checkpoint_seconds))
     failure = None

@@ -20,7 +20,7 @@ namespace {
 enum Score {
   kPlain,   // sum over views of |dL/d mean2d|, in NDC units
   kSeen,    // views in which the Gaussian was visible
-  kExtent,  // largest half side of the ellipse's box, over half the longer side of the image
+  kExtent,  // largest half side of the ellipse's box, over half the longer side of the whole photo
   kScoreRows
 };
 
@@ -247,8 +247,8 @@ void bind_step(nb::module_& m) {
       "photo"_a.none() = nb::none(),
       "Backward pass of the last render and one Adam step; returns how many gradient values were refused as not finite. Adds to "
       "`scores` [3, Gaussians] and fills `pose` [6] with the gradient to a motion of the camera (pose.hpp), where given. With "
-      "`clusters`, which `render` was given too, moves those chosen last. With `moved`, only blocks before that number are moved. `photo` is the width and "
-      "height of the whole photo that the image is a part of, which scores refer to.");
+      "`clusters`, which `render` was given too, moves those chosen last. With `moved`, only blocks before that number are moved. "
+      "`photo` is the width and height of the whole photo that the image is a part of, which scores refer to.");
   m.def(
       "gradients",
       [](Frame& frame, Blocks params, int degree, Image image, Image gradient, Blocks gradients, int threads) {
