@@ -24,7 +24,18 @@ STUDIES = [
     *((name, "STUDY") for name in ("stability", "worst", "functions", "stiffness", "precision")),
     *(
         (name, "STUDY")
-        for name in ("kernels", "scale", "sfm", "formats", "mesh", "live", "gabor", "tiles", "ground")
+        for name in (
+            "kernels",
+            "scale",
+            "sfm",
+            "formats",
+            "mesh",
+            "live",
+            "gabor",
+            "tiles",
+            "ground",
+            "workers",
+        )
     ),
     ("kernels", "SIZES"),
     ("sfm", "GROWTH"),

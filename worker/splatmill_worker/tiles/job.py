@@ -29,6 +29,7 @@ from splatmill_worker.pipeline.job import check_lpips, choose_kernels
 from splatmill_worker.pipeline.live import Looks, Onlookers
 from splatmill_worker.pipeline.stages import Outcome
 from splatmill_worker.tiles.folder import TILES, PlanFolder, digest_of, facts_of
+from splatmill_worker.tiles.remaining import Remaining
 from splatmill_worker.tiles.retrying import may_pass
 from splatmill_worker.tiles.stages import CHECKPOINTS, PLAN_FILE, SFM, Context, run_unit
 from splatmill_worker.tiles.units import ScenePlan
@@ -218,13 +219,21 @@ def _wait(work: _Work, tiles: Sequence[str]) -> None:
 
 
 class _Events:
-    """Emits the events of a unit as those of the job."""
+    """Emits the events of a unit as those of the job: the time that is left is that of all tiles."""
 
     def __init__(self, work: _Work, name: str, folder: Path) -> None:
         self._work, self._name, self._folder = work, name, folder
         self._label = {"coarse": "coarse model", "scene": "whole scene"}.get(
             name, f"{name.replace('-', ' ')} of {work.folder.plan.tiles}"
         )
+        self._began = time.monotonic()
+        self._remaining: Remaining | None = None
+        if name in work.folder.plan.part_names:
+            ended = work.folder.ended().items()
+            seconds = {
+                unit: None if end.path is None else facts_of(end.path)["seconds"] for unit, end in ended
+            }
+            self._remaining = Remaining.of(work.folder.plan, seconds, name)
 
     def __call__(self, event: Event) -> None:
         if isinstance(event, PreviewEvent | CamerasEvent):
@@ -232,7 +241,10 @@ class _Events:
             event = event.model_copy(update={"path": path.as_posix()})
         elif isinstance(event, ProgressEvent) and self._name != "cameras":
             note = self._label if event.note is None else f"{self._label}: {event.note}"
-            event = event.model_copy(update={"note": note})
+            eta = event.eta
+            if self._remaining is not None and eta is not None:
+                eta = round(self._remaining.seconds(time.monotonic() - self._began, eta), 1)
+            event = event.model_copy(update={"note": note, "eta": eta})
         self._work.emit(event)
 
 

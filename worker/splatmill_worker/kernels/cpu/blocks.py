@@ -21,7 +21,7 @@ FIRST = {name: end - GROUPS[name] for name, end in zip(GROUPS, accumulate(GROUPS
 def empty(count: int) -> Tensor:
     """Return zeroed blocks for `count` Gaussians."""
     blocks = torch.zeros(-(-count // LANES), PARAMETERS, LANES)
-    # Before the memory is first touched: the system hands out zeros of this size without touching them.
+    # torch has touched the memory: the system may still put huge pages in its place in the course of a long run.
     engine.advise_huge_pages(blocks)
     return blocks
 

@@ -94,7 +94,7 @@ void bind_pack(nb::module_& m) {
       "groups"_a, "first"_a, "blocks"_a.noconvert(), "count"_a, "order"_a.noconvert().none(), "threads"_a, "The reverse of `pack`.");
   m.def(
       "advise_huge_pages", [](Blocks blocks) { advise_huge_pages(blocks.data(), blocks.size() * sizeof(float)); },
-      "blocks"_a.noconvert(), "Advises the system to back blocks by huge pages; to be called before they are first touched.");
+      "blocks"_a.noconvert(), "Advises the system to back blocks by huge pages, best before they are first touched.");
 }
 
 }  // namespace splatmill
