@@ -204,7 +204,8 @@ def conclusion(rows: list[Row]) -> str:
     return (
         f"{alike} of {len(rows)} models have the bytes of the first one with as many threads; {disturbed} of them were "
         f"disturbed. One process takes {alone['seconds']:.0f} s. Where every unit has what one process has here, the "
-        f"longest chain of units takes {alone['chain']:.0f} s, {alone['chain'] / alone['in_turn']:.2f} of all units in turn."
+        f"longest chain of units takes {alone['chain']:.0f} s, {alone['chain'] / alone['in_turn']:.2f} of all units in "
+        "turn."
     )
 
 
