@@ -20,8 +20,8 @@ def test_the_first_tile_stands_for_the_others() -> None:
 
 def test_tiles_and_last_steps_take_what_the_others_took() -> None:
     trained = BEFORE | {"tile-1": 20.0, "tile-2": 40.0, "tile-4": None}
-    assert Remaining.of(PLAN, trained, "tile-3").seconds(5.0, 25.0) == pytest.approx(25.0 + 4 * 7.5)
-    trained |= {"tile-3": 30.0, "seam-1": 8.0, "seam-3": 10.0}
+    assert Remaining.of(PLAN, trained, "tile-3").seconds(5.0, 25.0) == pytest.approx(25.0 + 3 * 7.5)
+    trained |= {"tile-3": 30.0, "seam-1": 8.0, "seam-4": 0.0}
     left = Remaining.of(PLAN, trained, "seam-2")
     assert (left.tiles, left.seams) == (0, 1)
-    assert left.seconds(6.0, 6.0) == pytest.approx(6.0 + 10.0)
+    assert left.seconds(6.0, 6.0) == pytest.approx(6.0 + 10.0), "nothing was left to do for seam-4"

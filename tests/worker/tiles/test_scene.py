@@ -334,12 +334,23 @@ for name in names:
     monkeypatch.setattr(sys, "executable", str(fake))
     assert command.do_units(root, []) == 0
     assert PlanFolder.open(root).states() == {
-        name: "failed" if name == "tile-2" else "done" for name in PlanFolder.open(root).states()
+        unit.name: "failed" if unit.name == "tile-2" else "done" for unit in PlanFolder.open(root).plan.units
     }
     assert (root / "log").read_text().split() == [
         *("cameras", "coarse", "tile-1", "tile-2", "tile-2", "tile-2", "seam-1", "seam-2", "scene"),
     ]
     assert "tile-2 was tried 3 times, and its process was killed" in capsys.readouterr().out
+
+
+def test_a_program_whose_output_nobody_reads_ends(tmp_path: Path) -> None:
+    root = tmp_path / "plan"
+    capture = still_life.posed_capture(tmp_path / "capture")
+    assert command.make_plan(root, capture, OPTIONS.model_dump_json()) == 0
+    process = program("splatmill_worker", "unit", str(root))
+    assert process.stdout is not None
+    process.stdout.close()
+    assert process.wait(timeout=100) == command.UNWRITABLE
+    assert PlanFolder.open(root).states() == {}
 
 
 def test_photos_that_are_links_are_planned(whole: Path, tmp_path: Path) -> None:

@@ -69,18 +69,19 @@ def do_units(root: Path, names: Sequence[str], begun: int | None = None) -> int:
     """Do the units `names` one after the other, or all that can be done until none is left; returns the exit status.
 
     Of several, those are left out that other processes do or have done. The status is that of the unit with which it
-    ends, or the first that is not 0.
+    ends early, or the first that is not 0.
 
-    begun: descriptor of a file to which the name of each unit is written when it begins, a line each.
+    begun: descriptor of a file to which the name of each unit is written when it begins, a line each. The process that
+        reads it has begun this one, which ends with it.
     """
     if not names:
         return _reported(lambda: _do_all(root))
-    first, stopped = 0, _StopSignals()
+    first, stopped, parent = 0, _StopSignals(), os.getppid()
     for name in names:
-        status = _reported(partial(_do_one, root, name, stopped, begun, alone=len(names) == 1))
+        status = _reported(partial(_do_one, root, name, stopped, begun, alone=len(names) == 1), UNWRITABLE)
         if status in (UNWRITABLE, STOPPED, BROKEN):
             return status
-        if stopped.asked:
+        if stopped.asked or (begun is not None and os.getppid() != parent):
             return STOPPED
         first = first or status
         return_freed()
@@ -98,8 +99,8 @@ def list_units(root: Path, *, as_json: bool) -> int:
     return _reported(show)
 
 
-def _reported(run: Callable[[], int]) -> int:
-    """The exit status of `run`, with its errors printed as sentences."""
+def _reported(run: Callable[[], int], unread: int = 0) -> int:
+    """The exit status of `run`, with its errors printed as sentences. unread: where nobody reads what is printed."""
     try:
         return run()
     except Refusal as refusal:
@@ -110,7 +111,7 @@ def _reported(run: Callable[[], int]) -> int:
         return FAILED
     except BrokenPipeError:  # `splatmill units DIR | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+        return unread
     except OSError as error:
         print(f"Error: {error.filename or 'the folder'}: {error.strerror or error}.", file=sys.stderr)
         return UNWRITABLE
@@ -241,7 +242,9 @@ def _do_all(root: Path) -> int:
                 raise KeyboardInterrupt
             if status == UNWRITABLE:
                 return status
-            if status not in (0, CLAIMED) and last not in folder.states():
+            after = folder.states()
+            stuck = after == states and folder.running(last, after) is None
+            if last not in after and (status < 0 or status == BROKEN or stuck):
                 attempts[last] = attempts.get(last, 0) + 1
                 if attempts[last] >= MOST_ATTEMPTS:
                     _give_up(folder, last, status)

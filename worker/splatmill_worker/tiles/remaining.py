@@ -34,7 +34,12 @@ class Remaining:
         def known(names: tuple[str, ...]) -> tuple[float, ...]:
             return tuple(took for each in names if (took := seconds.get(each)) is not None)
 
-        tiles, seams = plan.tile_names, plan.seam_names
+        tiles = plan.tile_names
+        seams = tuple(  # those of a tile that failed have nothing to do
+            seam
+            for tile, seam in zip(tiles, plan.seam_names, strict=True)
+            if tile not in seconds or seconds[tile] is not None
+        )
         return Remaining(left(tiles), left(seams), known(tiles), known(seams), name in seams)
 
     def seconds(self, passed: float, eta: float) -> float:

@@ -22,7 +22,7 @@ State = Literal["done", "failed"]
 
 @dataclass(frozen=True)
 class Unit:
-    """A part of the work, which no two processes share.
+    """A part of the work, which one process does.
 
     name: unique in its plan.
     needs: names of the units whose output it reads.

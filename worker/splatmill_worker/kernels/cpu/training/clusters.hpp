@@ -43,7 +43,8 @@ class Drift {
 
 class Clusters {
  public:
-  // Only the blocks before number `moved`, a multiple of kClusterBlocks, have moments: the others stay where they are.
+  // Only the blocks before number `moved`, which is that of all or a multiple of kClusterBlocks, have moments: the others stay
+  // where they are.
   Clusters(const State& state, int64_t count, int64_t moved, int threads);
 
   // Chooses the clusters that `camera` may show, and brings them up to date.
