@@ -21,7 +21,7 @@ from splatmill_worker.__main__ import main
 from tests.support.paths import ROOT
 
 STUDIES = [
-    *((name, "STUDY") for name in ("stability", "worst", "functions", "stiffness", "precision")),
+    *((name, "STUDY") for name in ("stability", "worst", "functions", "stiffness")),
     *(
         (name, "STUDY")
         for name in (

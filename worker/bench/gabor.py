@@ -2,17 +2,15 @@
 
     splatmill bench gabor                                  # ten pictures, two sizes of model: about ten minutes
     splatmill bench gabor --pictures weave --side 64 --steps 100 --dry
-    splatmill bench gabor --only pictures --pictures --photos photos/a.jpg photos/b.jpg
+    splatmill bench gabor --pictures --photos photos/a.jpg photos/b.jpg
 
 Every picture is fitted by plain Gaussians and by ones of which half have a wave (9 parameters a Gaussian, 6 a wave) in
 as many steps, and once more by plain ones in the CPU seconds that the waves took. Of a photo, the square in its middle
 is reduced to the size of the pictures; photos are no part of the figure. Seconds are CPU seconds of one thread, with
-the thirteen evaluations of a fit. `--only scene` trains a scene in 3D, a woven floor and a striped ball, with waves and
-without.
+the thirteen evaluations of a fit.
 
 Expected before it was measured: several dB where one frequency repeats (stripes, knit, weave), nothing on smooth
 colours, and a loss of some tenths on text, whose edges need places rather than frequencies; twice the time of a step.
-In 3D less than in the plane, since a wave has 7 parameters beside 14 and has to agree with every view.
 """
 
 from __future__ import annotations
@@ -29,7 +27,6 @@ import _page
 import _plot
 import numpy as np
 import torch
-from _gabor import scene
 from _gabor.pictures import PICTURES, picture
 from _rows import Row, distinct, footer, of
 from _studies.study import Study
@@ -81,29 +78,6 @@ def compared(name: str, pixels: np.ndarray, options: argparse.Namespace) -> Iter
         yield row | {"method": "plain, equal time"} | fitted(pixels, limit, steps, options.seed, gabor=False)
 
 
-def in_3d(options: argparse.Namespace) -> Iterator[Row]:
-    """The rows of the scene: plain, with waves, and plain in their time, at each number of Gaussians and seed."""
-    torch.set_num_threads(1)
-    views = scene.views(options.views)
-    trained(views, 50, 20, 0, waves=True)  # a first run loads what the others use
-    for count in options.gaussians:
-        for seed in (options.seed, options.seed + 1):
-            row = {"bench": "gabor", "picture": "scene", "plain_gaussians": count, "seed": seed}
-            plain = trained(views, count, options.scene_steps, seed, waves=False)
-            yield row | {"method": "plain"} | plain
-            waved = trained(views, count, options.scene_steps, seed, waves=True)
-            yield row | {"method": "gabor"} | waved
-            steps = round(options.scene_steps * waved["seconds"] / plain["seconds"])
-            yield row | {"method": "plain, equal time"} | trained(views, count, steps, seed, waves=False)
-
-
-def trained(views: scene.Views, count: int, steps: int, seed: int, *, waves: bool) -> Row:
-    """The fields of one training of the scene."""
-    began = time.process_time()
-    found = scene.trained(views, count, steps, seed, waves=waves)
-    return {"steps": steps, **found, "seconds": round(time.process_time() - began, 1)}
-
-
 def fitted(pixels: np.ndarray, limit: int, steps: int, seed: int, *, gabor: bool) -> Row:
     """The fields of one fit with the parameters of `limit` plain Gaussians."""
     with tempfile.TemporaryDirectory(prefix="splatmill-bench-") as folder:
@@ -140,32 +114,8 @@ def fitted(pixels: np.ndarray, limit: int, steps: int, seed: int, *, gabor: bool
     }
 
 
-def table_3d(rows: list[Row]) -> str:
-    """PSNR on the views that were held out."""
-    lines = []
-    for plain in of(rows, picture="scene", method="plain"):
-        same = {name: plain[name] for name in ("picture", "plain_gaussians", "seed")}
-        waved, longer = of(rows, method="gabor", **same), of(rows, method="plain, equal time", **same)
-        if waved and longer:
-            lines.append(
-                [
-                    f"{plain['parameters']:,}", plain["gaussians"], f"{waved[0]['gaussians']} ({waved[0]['waves']})",
-                    plain["seed"], f"{plain['psnr']:.2f} dB", f"{waved[0]['psnr']:.2f} dB",
-                    f"{waved[0]['psnr'] - plain['psnr']:+.2f} dB", f"{waved[0]['psnr'] - longer[0]['psnr']:+.2f} dB",
-                    f"{plain['seconds']:.1f}", f"{waved[0]['seconds']:.1f}",
-                ]
-            )  # fmt: skip
-    head = "parameters:|plain Gaussians:|with waves:|seed:|held-out PSNR plain:|with waves:|gain:|gain in equal time:"
-    return _page.table(f"{head}|CPU seconds plain:|with waves:", lines)
-
-
-def in_the_plane(rows: list[Row]) -> list[Row]:
-    return [row for row in rows if row["picture"] != "scene"]
-
-
 def pairs(rows: list[Row]) -> Iterator[tuple[Row, Row, Row]]:
     """Plain, Gabor and plain in Gabor's time of each picture and size of model."""
-    rows = in_the_plane(rows)
     for name in distinct(rows, "picture"):
         for share in sorted(set(distinct(rows, "pixels_per_gaussian"))):
             found = [
@@ -192,7 +142,6 @@ def table(rows: list[Row]) -> str:
 
 def conclusion(rows: list[Row]) -> str:
     """When waves pay, by what the rows say."""
-    rows = in_the_plane(rows)
     said = []
     for share in sorted(set(distinct(rows, "pixels_per_gaussian"))):
         here = [(p, g, t) for p, g, t in pairs(rows) if p["pixels_per_gaussian"] == share]
@@ -213,7 +162,6 @@ def conclusion(rows: list[Row]) -> str:
 
 def draw(rows: list[Row]) -> Figure:
     """For every picture, the root mean square error against CPU seconds, at the largest model."""
-    rows = in_the_plane(rows)
     share = min(distinct(rows, "pixels_per_gaussian"), default=0)
     names = [name for name in PICTURES if of(rows, picture=name)]
     columns = max(1, min(5, len(names)))
@@ -240,18 +188,17 @@ def draw(rows: list[Row]) -> Figure:
 
 
 def made(rows: list[Row]) -> str:
-    planes = in_the_plane(rows)
-    steps = ", ".join(str(x) for x in distinct(of(planes, method="plain"), "steps"))
-    side = ", ".join(str(x) for x in distinct(planes, "side"))
+    steps = ", ".join(str(x) for x in distinct(of(rows, method="plain"), "steps"))
+    side = ", ".join(str(x) for x in distinct(rows, "side"))
     return f"Made by `splatmill bench gabor` with {steps} steps at {side} pixels.\n{footer(rows)}"
 
 
 STUDY = Study(
     name="gabor",
     about=__doc__,
-    cases={"pictures": measured, "scene": in_3d},
-    key=("picture", "pixels_per_gaussian", "plain_gaussians", "method", "seed"),
-    blocks={"conclusion": conclusion, "table": table, "scene": table_3d, "footer": made},
+    cases={"pictures": measured},
+    key=("picture", "pixels_per_gaussian", "method", "seed"),
+    blocks={"conclusion": conclusion, "table": table, "footer": made},
     figures={"gabor": draw},
     options={
         "pictures": {"nargs": "*", "default": list(PICTURES)},
@@ -259,9 +206,6 @@ STUDY = Study(
         "pixels": {"nargs": "+", "type": int, "default": [16, 64], "help": "pixels for each plain Gaussian"},
         "side": {"type": int, "default": 96},
         "steps": {"type": int, "default": 800},
-        "views": {"type": int, "default": 30, "help": "of the scene, every 5th held out"},
-        "gaussians": {"nargs": "+", "type": int, "default": [200, 600], "help": "plain ones of the scene"},
-        "scene-steps": {"type": int, "default": 800},
         "seed": {"type": int, "default": 0},
     },
 )

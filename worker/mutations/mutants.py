@@ -178,7 +178,7 @@ MUTANTS = [
     cpu("flushing outlives the kernel", "simd/threads.hpp", "~FlushDenormals() { _mm_setcsr(saved_); }", "~FlushDenormals() {}"),
     # ---- layout
     cpu("the largest alpha is 0.9989", "layout/layout.hpp", "kAlphaMax = 0.999f;", "kAlphaMax = 0.9989f;"),
-    cpu("the end of a pixel is at 1.1e-4", "layout/storage.hpp", "kTransmittanceMin = 1e-4f;", "kTransmittanceMin = 1.1e-4f;"),
+    cpu("the end of a pixel is at 1.1e-4", "layout/record.hpp", "kTransmittanceMin = 1e-4f;", "kTransmittanceMin = 1.1e-4f;"),
     cpu("the last Gaussian of a scene is left out", "layout/layout.hpp", "(1u << left) - 1u", "(1u << (left - 1)) - 1u"),
     cpu("rows of a packed group are taken from its start", "bindings/pack.cpp", "load_unaligned(rows[l] + k)",
         "load_unaligned(rows[l])"),

@@ -113,7 +113,7 @@ def test_files_that_are_stored_at_once_all_count(connection: redis.Redis, limite
     def store(thread: int) -> None:
         start.wait()
         for number in range(20):
-            room.store(f"{thread}/{number}", 100)
+            room.store({f"{thread}/{number}": 100})
 
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(store, range(8)))

@@ -26,25 +26,25 @@ class Room:
         self._stored: dict[str, int] = {}
         self._unpacked: dict[str, int] = {}
 
-    def store(self, name: str, size: int) -> None:
-        """Reserve the bytes of a file of the job, in place of those that were reserved for it before.
+    def store(self, files: Mapping[str, int]) -> None:
+        """Reserve the sizes of files of the job by their names, in place of those that were reserved for them before.
 
         While Redis cannot be reached nothing is reserved: the state of a job is worth more than a limit, and a later
         scan of storage counts it.
         """
         with self._lock:
-            sizes = self._stored | {name: size}
+            sizes = {**self._stored, **files}
             with suppress(redis.RedisError):
                 self._reserve(reservations.job(self._job_id), sum(sizes.values()))
             self._stored = sizes
 
-    def store_all(self, sizes: Mapping[str, int]) -> None:
-        """Reserve the bytes of all files of a model, once Redis can be reached.
+    def store_all(self, files: Mapping[str, int]) -> None:
+        """Reserve the sizes of all files of a model, once Redis can be reached.
 
         Raises redis.RedisError if that takes longer than PATIENCE.
         """
         with self._lock:
-            together = {**self._stored, **sizes}
+            together = {**self._stored, **files}
             patiently(lambda: self._reserve(reservations.job(self._job_id), sum(together.values())))
             self._stored = together
 

@@ -74,8 +74,8 @@ class Gaussians:
         """The Gaussians with `function` applied to each of the five tensors."""
         return Gaussians(**{name: function(value) for name, value in self.parameters().items()})
 
-    def select(self, rows: Tensor) -> Gaussians:
-        """The rows picked by a boolean mask [N] or by indices."""
+    def select(self, rows: Tensor | slice) -> Gaussians:
+        """The rows picked by a boolean mask [N], by indices, or without a copy by a slice."""
         return self.map(lambda value: value[rows])
 
     def most_opaque(self, limit: int) -> Gaussians:

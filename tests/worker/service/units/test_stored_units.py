@@ -73,7 +73,7 @@ def test_what_one_worker_did_is_found_by_another(
     units, rooms = StoredUnits(storage, JOB), dict[str, int]()
     output = here.ended()["cameras"].path
     assert output is not None
-    units.put(output, rooms.__setitem__)
+    units.put(output, rooms.update)
     assert {name.removeprefix(f"{output.name}/"): size for name, size in rooms.items()} == {
         "sfm/points": 3,
         DONE: len((output / DONE).read_bytes()),

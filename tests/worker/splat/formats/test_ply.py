@@ -62,6 +62,14 @@ def test_the_layout_is_the_one_viewers_read(tmp_path: Path) -> None:
     assert np.array_equal(table[:, 3:6], np.zeros((3, 3)))
 
 
+def test_a_model_of_several_pieces_has_all_its_rows_in_order(tmp_path: Path) -> None:
+    scene = some_gaussians(2 * ply.PIECE + 5, 0)
+    scene.logit_opacities[:] = 1.0
+    scene.means[[0, ply.PIECE, 2 * ply.PIECE + 4]] = math.nan
+    assert ply.write(tmp_path / "m.ply", scene) == scene.count - 3
+    assert torch.equal(ply.read(tmp_path / "m.ply").gaussians.means, scene.means[scene.finite()])
+
+
 def test_degrees_are_padded_on_request(tmp_path: Path) -> None:
     ply.write(tmp_path / "m.ply", some_gaussians(5, 1), degree=3)
     after = ply.read(tmp_path / "m.ply").gaussians

@@ -80,7 +80,7 @@ class Mirror:
                 continue  # a leading dot marks a file that is still being written
             name = path.relative_to(run).as_posix()
             try:
-                self._room.store(name, state.st_size)
+                self._room.store({name: state.st_size})
                 storage.put(f"{layout.job_work(self._folder.job_id)}/{name}", path)
             except (StorageError, FileNotFoundError, QuotaReached) as error:
                 self._warn(f"{name} could not be copied to storage and will be tried again: {error}")

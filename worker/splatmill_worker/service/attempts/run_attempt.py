@@ -282,7 +282,7 @@ def _pipeline(attempt: Attempt, load: LoadPipeline, row: JobRow, folder: JobFold
     from splatmill_worker.service.units.other_workers import OtherWorkers
     from splatmill_worker.tiles import job
 
-    others = OtherWorkers(attempt.connection, folder, attempt.generation, room)
+    others = OtherWorkers(attempt.connection, folder, attempt.generation, room, log.warning)
     return partial(job.run, others=others)
 
 
@@ -323,7 +323,7 @@ def _forward(event: Event, folder: JobFolder, room: Room, outbox: Outbox) -> Non
 
 def _store(folder: JobFolder, room: Room, name: str, target: str, path: str) -> None:
     content = (folder.run / path).read_bytes()
-    room.store(name, len(content))
+    room.store({name: len(content)})
     folder.storage.put(target, content)
 
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
 import redis
 
 from splatmill.backplane.queue import queue
+from splatmill_worker.errors import QuotaReached
 from splatmill_worker.service.job_folder import JobFolder
 from splatmill_worker.service.redis_patience import patiently
 from splatmill_worker.service.room import Room
@@ -21,12 +23,22 @@ class OtherWorkers:
 
     A tile waits in the queue until a worker takes it, or the attempt takes it back to do it itself. So nobody waits for
     a worker that does not come, and no tile is done by two unless one of them is lost.
+
+    Where the owner's storage has no room for what other workers need, none is given a tile from then on.
     """
 
-    def __init__(self, connection: redis.Redis, folder: JobFolder, generation: int, room: Room) -> None:
-        """folder: of the job, on this machine."""
+    def __init__(
+        self,
+        connection: redis.Redis,
+        folder: JobFolder,
+        generation: int,
+        room: Room,
+        warn: Callable[[str], None],
+    ) -> None:
+        """folder: of the job, on this machine. warn: called with a sentence where there is no room."""
         self._connection, self._job_id, self._generation = connection, folder.job_id, generation
-        self._room, self._job_folder = room, folder
+        self._room, self._job_folder, self._warn = room, folder, warn
+        self._alone = False
         self._units = StoredUnits(folder.storage, folder.job_id)
         self._numbers: dict[str, int] = {}
         self._offered: set[str] = set()
@@ -42,13 +54,15 @@ class OtherWorkers:
                 self.stored(ended.path)
 
     def stored(self, output: Path) -> None:
-        """Store the output of a unit."""
-        self._units.put(output, self._room.store)
+        """Store the output of a unit, if the owner's storage has room for it."""
+        if not self._alone:
+            with self._alone_without_room():
+                self._units.put(output, self._room.store)
 
     def offer(self, tiles: Sequence[str]) -> None:
         """Put tiles into the queue, each once."""
         for name in tiles:
-            if name not in self._offered:
+            if name not in self._offered and not self._alone:
                 self._offered.add(name)
                 patiently(partial(self._on, queue.offer_tile, name))
 
@@ -58,13 +72,23 @@ class OtherWorkers:
 
     def gather(self, folder: PlanFolder) -> None:
         """Bring the outputs of others into the folder of the plan, and count them for the owner of the job."""
-        for name, size in self._units.bring(folder, check=self._job_folder.check_space):
-            self._room.store(name, size)
+        brought = dict(self._units.bring(folder, check=self._job_folder.check_space))
+        if brought:
+            with self._alone_without_room():
+                self._room.store(brought)
 
     def end(self) -> None:
         """Take all tiles out of the queue that no worker has begun."""
         for tile in sorted(self._offered):
             patiently(partial(self._on, queue.take_back_tile, tile))
+
+    @contextmanager
+    def _alone_without_room(self) -> Iterator[None]:
+        try:
+            yield
+        except QuotaReached as error:
+            self._alone = True
+            self._warn(f"No other worker is given tiles of this job from now on, since they need copies: {error}")
 
     def _on(self, act: Callable[[redis.Redis, str, int, int], bool], name: str) -> bool:
         return act(self._connection, self._job_id, self._generation, self._numbers[name])

@@ -45,16 +45,15 @@ class StoredUnits:
             return None
         return ScenePlan.from_dict(document)
 
-    def put(self, output: Path, room: Callable[[str, int], None] = lambda name, size: None) -> None:
+    def put(self, output: Path, room: Callable[[Mapping[str, int]], None] = lambda files: None) -> None:
         """Store the output of a unit, its last file last, unless it is stored.
 
-        room: called with the name and the size of each file before it is stored.
+        room: called with the names and sizes of the files before one of them is stored.
         """
         target, last = f"{self._prefix}/{output.name}", output / DONE
         files = [*(path for path in sorted(output.rglob("*")) if path.is_file() and path != last), last]
         names = [path.relative_to(output).as_posix() for path in files]
-        for path, name in zip(files, names, strict=True):
-            room(f"{output.name}/{name}", path.stat().st_size)
+        room({f"{output.name}/{name}": path.stat().st_size for path, name in zip(files, names, strict=True)})
         if not self._storage.exists(f"{target}/{DONE}"):
             for path, name in zip(files, names, strict=True):
                 self._storage.put(f"{target}/{name}", path)

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import torch
-from plyfile import PlyData, PlyElement, PlyParseError
+from plyfile import PlyData, PlyElement, PlyParseError, PlyProperty
 
 from splatmill.files import replacing
 from splatmill_worker.errors import ModelUnreadable
 from splatmill_worker.readers import ply_document
 from splatmill_worker.readers.reader_memory import check_gaussians
 from splatmill_worker.splat.formats import ply_columns, ply_comments
-from splatmill_worker.splat.formats.contents import NO_OFFSET, Contents, Offset, unit, visible
+from splatmill_worker.splat.formats.contents import NO_OFFSET, Contents, Offset, shown, unit, visible
 from splatmill_worker.splat.gaussians import Gaussians
+
+PIECE = 65_536
+"""Gaussians that are written at a time, so that memory holds no second model."""
 
 COMPRESSED_ELEMENTS = ("chunk", "sh")
 """Elements of a compressed .ply besides its vertices."""
@@ -49,14 +52,33 @@ def write(
     file (some viewers read degree 3 only); that of the Gaussians where None. comments: lines of the header.
     The file is replaced atomically and synced.
     """
-    if degree is not None:
-        gaussians = gaussians.padded(degree)
-    gaussians = visible(gaussians)
-    n = gaussians.count
+    names = property_names(gaussians.degree if degree is None else degree)
+    n = sum(int(shown(piece).sum()) for piece in _pieces(gaussians, degree))
+    document = PlyData(
+        [PlyElement("vertex", [PlyProperty(name, "float") for name in names], n)],
+        byte_order="<",
+        comments=[*comments, *ply_comments.comments_of(offset, antialiased)],
+    )
+    with replacing(path, sync=True) as part, part.open("wb") as stream:
+        stream.write(document.header.encode("ascii") + b"\n")
+        for piece in _pieces(gaussians, degree):
+            stream.write(_rows(visible(piece)))
+    return n
+
+
+def _pieces(gaussians: Gaussians, degree: int | None) -> Iterator[Gaussians]:
+    """PIECE rows at a time, at an SH degree where one is given."""
+    for first in range(0, gaussians.count, PIECE):
+        piece = gaussians.select(slice(first, first + PIECE))
+        yield piece if degree is None else piece.padded(degree)
+
+
+def _rows(gaussians: Gaussians) -> bytes:
+    """The vertices of a file, in the order of `property_names`."""
     columns = torch.cat(
         [
             gaussians.means,
-            torch.zeros(n, 3),
+            torch.zeros(gaussians.count, 3),
             gaussians.sh[:, 0],
             gaussians.sh[:, 1:].transpose(1, 2).flatten(1),  # channel-major: all R, then all G, then all B
             gaussians.logit_opacities[:, None],
@@ -65,19 +87,7 @@ def write(
         ],
         dim=1,
     )
-    names = property_names(gaussians.degree)
-    table = (
-        np.ascontiguousarray(columns.numpy(), dtype="<f4").view([(name, "<f4") for name in names]).reshape(n)
-    )
-    document = PlyData(
-        [PlyElement.describe(table, "vertex")],
-        byte_order="<",
-        comments=[*comments, *ply_comments.comments_of(offset, antialiased)],
-    )
-
-    with replacing(path, sync=True) as part, part.open("wb") as stream:
-        document.write(stream)
-    return n
+    return columns.numpy().astype("<f4", copy=False).tobytes()
 
 
 def read(path: Path) -> Contents:

@@ -48,7 +48,7 @@ void take_lists(Frame& frame, const ProjectedRows& rows, int64_t count, const in
         const auto id = static_cast<uint32_t>(ids[k]);
         uint32_t blocks = 0;
         if (!culled(rows, id)) {
-          const Reach reach(widened(frame.records[id]));
+          const Reach reach(frame.records[id]);
           blocks = reach.blocks(reach.row(tile / columns), tile % columns);
         }
         frame.entries[k] = {id, static_cast<uint32_t>(k), blocks};
@@ -105,7 +105,7 @@ void gradients_of_rows(const Frame& frame, const ProjectedRows& out, int threads
       const float* pair = &frame.pair_sums[static_cast<int64_t>(k) * kPairSums];
       for (int j = 0; j < kSums; ++j) s[j] += pair[j];
     }
-    if (any) write_gradient(widened(frame.records[i]), s, out, i);
+    if (any) write_gradient(frame.records[i], s, out, i);
   }
 }
 

@@ -75,7 +75,7 @@ void differentiate_tile(Frame& frame, const ImageGradient& g, int tile) {
       frame.touches[entry.slot].blocks = 0;
       continue;
     }
-    const Record& r = widened(frame.records[entry.id]);
+    const Record& r = frame.records[entry.id];
     const TileForm form(r, lanes, x0, y0);
     const Float level = splat(r.level);
     const Float red = splat(r.color[0]), green = splat(r.color[1]), blue = splat(r.color[2]);

@@ -52,7 +52,7 @@ void blend_tile(Frame& frame, const Planes& image, const float background[3], in
     if ((k - begin) % kEntriesBetweenChecks == 0 && !(live = still_live(blocks, live))) break;
     if (k + kEntriesAhead < end) __builtin_prefetch(&frame.records[frame.entries[k + kEntriesAhead].id]);
     Entry& entry = frame.entries[k];
-    const Record& r = widened(frame.records[entry.id]);
+    const Record& r = frame.records[entry.id];
     const TileForm form(r, lanes, x0, y0);
     const Float level = splat(r.level);
     const Float red = splat(r.color[0]), green = splat(r.color[1]), blue = splat(r.color[2]);

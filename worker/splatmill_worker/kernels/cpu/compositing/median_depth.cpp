@@ -28,7 +28,7 @@ void depth_of_tile(Frame& frame, const float* tilts, float transmittance, const 
   uint32_t live = blocks_inside(tile_x, tile_y, cam);
   for (int64_t k = frame.offsets[tile]; k < frame.offsets[tile + 1] && live; ++k) {
     const Entry& entry = frame.entries[k];
-    const Record& r = widened(frame.records[entry.id]);
+    const Record& r = frame.records[entry.id];
     const TileForm form(r, lanes, x0, y0);
     const Float level = splat(r.level);
     const float* tilt = tilts + 2 * static_cast<int64_t>(entry.id);

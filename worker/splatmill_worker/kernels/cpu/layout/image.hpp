@@ -3,7 +3,7 @@
 
 #include <cstdint>
 
-#include "layout/storage.hpp"
+#include "layout/record.hpp"
 
 namespace splatmill {
 

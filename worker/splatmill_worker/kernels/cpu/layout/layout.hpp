@@ -3,7 +3,7 @@
 
 #include <cstdint>
 
-#include "layout/storage.hpp"
+#include "layout/record.hpp"
 
 namespace splatmill {
 
@@ -14,16 +14,10 @@ inline constexpr int kQuat = 6;
 inline constexpr int kLogit = 10;
 inline constexpr int kSh = 11;  // coefficient k, channel c at kSh + 3 k + c
 inline constexpr int kRows = 59;
-inline constexpr int kBlockFloats = kRows * kLanes;  // of a block of gradients
-inline constexpr int kParameterFloats = kLanes * kSh + kLanes * (kRows - kSh) * Harmonics::kBytes / 4;
+inline constexpr int kBlockFloats = kRows * kLanes;
 
 inline int64_t blocks_for(int64_t count) { return (count + kLanes - 1) / kLanes; }
 SPLATMILL_INLINE Float row(const float* block, int r) { return load(block + r * kLanes); }
-
-// Row `r`, from kSh on, of a block of parameters.
-SPLATMILL_INLINE Float sh_row(const float* block, int r) {
-  return Harmonics::load(reinterpret_cast<const char*>(block + kSh * kLanes) + (r - kSh) * kLanes * Harmonics::kBytes);
-}
 
 // Lanes of block `b` that hold a Gaussian; the last block may be partly empty.
 inline uint32_t lanes_of(int64_t b, int64_t count) {

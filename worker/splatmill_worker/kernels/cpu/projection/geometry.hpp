@@ -132,7 +132,7 @@ SPLATMILL_INLINE void sh_color(const float* p, const Float* basis, int degree, F
   for (int c = 0; c < 3; ++c) color[c] = splat(0.5f);
   const int n = (degree + 1) * (degree + 1);
   for (int k = 0; k < n; ++k)
-    for (int c = 0; c < 3; ++c) color[c] = fma(basis[k], sh_row(p, kSh + 3 * k + c), color[c]);
+    for (int c = 0; c < 3; ++c) color[c] = fma(basis[k], row(p, kSh + 3 * k + c), color[c]);
 }
 
 // The triangular factor of the conic as a Record holds it: level - u^2 - v^2 = log2 alpha.
@@ -226,7 +226,7 @@ SPLATMILL_INLINE void project_backward(const float* p, const Camera& cam, int de
   const int n_basis = (degree + 1) * (degree + 1);
   for (int n = 0; n < n_basis; ++n) {
     const int r = kSh + 3 * n;
-    e[n] = fma(d_color[0], sh_row(p, r), fma(d_color[1], sh_row(p, r + 1), d_color[2] * sh_row(p, r + 2)));
+    e[n] = fma(d_color[0], row(p, r), fma(d_color[1], row(p, r + 1), d_color[2] * row(p, r + 2)));
     for (int c = 0; c < 3; ++c) store(g + (kSh + 3 * n + c) * kLanes, basis[n] * d_color[c]);
   }
   const Direction dd = sh_basis_backward(degree, dir, e);

@@ -51,7 +51,7 @@ void project_frame(const float* blocks, int64_t count, int degree, Frame& frame,
   collect_touches(frame, count, visited.blocks(), threads, [&](int64_t begin, int64_t end, TouchWriter& writer) {
     for (int64_t i = begin; i < end; ++i) {
       const int64_t b = visited.block(i);
-      const float* p = blocks + b * kParameterFloats;
+      const float* p = blocks + b * kBlockFloats;
       uint32_t seen = 0;
       Projection o;
       project_geometry(p, cam, o);
@@ -83,7 +83,7 @@ void project_rows(const float* blocks, int64_t count, int degree, const Camera& 
     const FlushDenormals flush;
 #pragma omp for schedule(static)
     for (int64_t b = 0; b < n; ++b) {
-      const float* p = blocks + b * kParameterFloats;
+      const float* p = blocks + b * kBlockFloats;
       Projection o;
       project_geometry(p, cam, o);
       Float color[3], fields[kProjectedFloats];
@@ -124,7 +124,7 @@ void project_rows_backward(const float* blocks, int64_t count, int degree, const
   for (int64_t chunk = 0; chunk < chunks; ++chunk) {
     const FlushDenormals flush;
     for (int64_t b = chunk * kChunk; b < std::min(n, (chunk + 1) * kChunk); ++b) {
-      const float* p = blocks + b * kParameterFloats;
+      const float* p = blocks + b * kBlockFloats;
       float* g = grad_blocks + b * kBlockFloats;
       for (int r = 0; r < kRows; ++r) store(g + r * kLanes, splat(0.0f));
       Projection o;

@@ -29,7 +29,8 @@ SPLATMILL_INLINE float largest(Float x) {
 }
 
 SPLATMILL_INLINE Float pull(const BlockState& at, int r) {
-  const Float m = FirstMoment::load(at.exp_avg(r)), v = SecondMoment::load(at.exp_avg_sq(r));
+  Float m, v;
+  at.load_moments(r, m, v);
   return abs(m * reciprocal_sqrt(max(v, 1e-37f)));
 }
 
@@ -40,7 +41,7 @@ Box measured(const State& state, int64_t cluster, int64_t count, bool moves) {
   for (int j = 0; j < 3; ++j) low[j] = splat(kInfinite), high[j] = splat(-kInfinite);
   const int64_t end = std::min(blocks_for(count), (cluster + 1) * kClusterBlocks);
   for (int64_t b = cluster * kClusterBlocks; b < end; ++b) {
-    const float* p = state.params + b * kParameterFloats;
+    const float* p = state.params + b * kBlockFloats;
     const Mask used = mask_of(lanes_of(b, count));
     for (int j = 0; j < 3; ++j) {
       const Float x = row(p, kMean + j);
@@ -180,14 +181,13 @@ void Clusters::catch_up(const State& state, int64_t cluster) {
   const int64_t end = std::min(blocks_for(count_), (cluster + 1) * kClusterBlocks);
   for (int64_t b = cluster * kClusterBlocks; b < end; ++b) {
     const BlockState at(state, b);
-    Noise noise(drift_.updates(), b);
     for (int rate = 0; rate < kRates; ++rate) {
       const Float way = splat(static_cast<float>(travel[rate]));
       for (int r = kRateRows[rate]; r < std::min(rows_, kRateRows[rate + 1]); ++r) {
         Float x, m, v;
         at.load(r, x, m, v);
         const Float safe = max(v, 1e-37f), deviation = fma(safe, reciprocal_sqrt(safe), splat(kAdamEps));
-        at.store(r, fnma(way * m, reciprocal(deviation), x), m * decay1, v * decay2, noise);
+        at.store(r, fnma(way * m, reciprocal(deviation), x), m * decay1, v * decay2);
       }
     }
   }

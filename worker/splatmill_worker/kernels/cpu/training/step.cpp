@@ -37,7 +37,6 @@ struct Update {
   State state;
   float rates[kRows] = {};  // with the bias correction of the first moment
   AdamStep adam;            // weights and bias correction of the second moment; its `size` is in `rates` already
-  int64_t step = 0;
   float* gradients = nullptr;
   float* scores = nullptr;  // [kScoreRows][score_stride]; null where none are kept
   int64_t score_stride = 0;
@@ -95,7 +94,7 @@ template <bool kAdam, bool kPose>
 int64_t update_block(const Frame& frame, const ImageGradient& g, const Scene& scene, const Update& update, int64_t b,
                      double* pose) {
   const int rows = rows_of(scene.degree);
-  const float* p = scene.params + b * kParameterFloats;
+  const float* p = scene.params + b * kBlockFloats;
   const uint32_t seen = frame.visible[b];
   const Mask visible = mask_of(seen);
   alignas(64) float gradient[kBlockFloats];
@@ -119,14 +118,13 @@ int64_t update_block(const Frame& frame, const ImageGradient& g, const Scene& sc
   } else {
     int64_t refused = 0;
     const BlockState at(update.state, b);
-    Noise noise(update.step, b);
     for (int r = 0; r < rows; ++r) {
       Float x, m, v;
       at.load(r, x, m, v);
       const Float slope = seen ? keep(visible, load(gradient + r * kLanes)) : splat(0.0f);
       const Mask good = adam_update(x, m, v, slope, splat(update.rates[r]), update.adam);
       refused += kLanes - __builtin_popcount(bits(good));
-      at.store(r, x, m, v, noise);
+      at.store(r, x, m, v);
     }
     return refused;
   }
@@ -212,7 +210,6 @@ void bind_step(nb::module_& m) {
         update.state = {params.data(), exp_avg.data(), exp_avg_sq.data()};
         update.adam = AdamStep(step, beta2);
         for (int r = 0; r < kRows; ++r) update.rates[r] = rates.at(r) * update.adam.size;
-        update.step = step;
         const ImageGradient g{planes_of(image, frame.camera), planes_of(gradient, frame.camera), gradient.shape(0) == 5};
         if (scores) update.scores = scores->data(), update.score_stride = static_cast<int64_t>(scores->shape(1));
         const auto [width, height] = photo.value_or(std::tuple(frame.camera.width, frame.camera.height));
