@@ -77,6 +77,35 @@ def test_programs_and_images_are_those_of_compose() -> None:
     assert script == services["redis"]["command"][-1].replace("$$", "$")
 
 
+def test_services_and_policies_are_of_pods_that_there_are() -> None:
+    labels = {
+        name: item["spec"]["template"]["metadata"]["labels"]
+        for item in ITEMS
+        for name in [item["metadata"]["name"]]
+        if "template" in item["spec"]
+    }
+    chosen = re.findall(r"(?:selector|matchLabels): (\{app: \w+\})", (FOLDER / "splatmill.yml").read_text())
+    assert {yaml.safe_load(each)["app"] for each in chosen} == set(PODS)
+    assert labels == {name: {"app": name} for name in PODS}
+    ports = {item["metadata"]["name"]: item["spec"]["ports"] for item in ITEMS if item["kind"] == "Service"}
+    assert ports == {"redis": [{"port": 6379}], "server": [{"port": 8080}], "renderer": [{"port": 8090}]}
+
+
+@pytest.mark.parametrize("name", PODS)
+def test_a_pod_has_the_volumes_and_ports_that_it_names(name: str) -> None:
+    (container,) = PODS[name]["containers"]
+    claims = {"data"} if name == "redis" else set()
+    volumes = {volume["name"] for volume in PODS[name].get("volumes", [])} | claims
+    assert {mount["name"] for mount in container["volumeMounts"]} == volumes
+    for probe in (
+        container[key] for key in container if key.endswith("Probe") and "httpGet" in container[key]
+    ):
+        assert str(probe["httpGet"]["port"]) in container["command"]
+    stated = [variable["name"] for variable in container.get("env", [])]
+    if "REDIS_URL" in stated:  # Kubernetes puts only earlier variables into a value
+        assert stated.index("REDIS_PASSWORD") < stated.index("REDIS_URL")
+
+
 def test_a_worker_has_time_to_store_a_checkpoint() -> None:
     assert PODS["worker"]["terminationGracePeriodSeconds"] > STOP_GRACE
 
@@ -106,7 +135,7 @@ def test_the_autoscaler_counts_by_metrics_that_there_are(tmp_path: Path) -> None
     rules = {"groups": [{"name": "keda", "rules": [{"record": "wanted:workers", "expr": query}]}]}
     series = [
         {"series": f'splatmill_queue_length{{queue="{queue}",instance="{api}"}}', "values": str(count)}
-        for queue, count in (("cpu", 2), ("any", 3), ("gpu", 0))
+        for queue, count in (("cpu", 2), ("any", 3), ("gpu", 5))
         for api in "ab"
     ]
     series += [

@@ -1,1 +1,1 @@
-"""What `splatmill bench gabor` alone uses: its pictures, and its scene of a repeated texture."""
+"""What `splatmill bench gabor` alone uses: its pictures."""

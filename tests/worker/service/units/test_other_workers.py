@@ -5,6 +5,7 @@ Does not prove that they train the tiles: tests/service/test_tiles.py does.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,7 @@ from splatmill.schema import TrainOptions
 from splatmill_worker.service.job_folder import JobFolder
 from splatmill_worker.service.room import Room
 from splatmill_worker.service.units.other_workers import OtherWorkers
+from splatmill_worker.service.units.stored_units import StoredUnits
 from splatmill_worker.tiles.folder import PlanFolder
 from splatmill_worker.tiles.units import ScenePlan
 from tests.support.jobs import CAPTURE, write_row
@@ -25,39 +27,110 @@ from tests.support.jobs import CAPTURE, write_row
 JOB = "job00001"
 
 
-@pytest.mark.parametrize("fits", [True, False])
-def test_tiles_are_offered_only_where_their_copies_fit_into_the_quota(
-    local: Storage, connection: redis.Redis, room: Room, tmp_path: Path, fits: bool
-) -> None:
-    options = TrainOptions(tiles=2)
-    write_row(connection, JOB, options=options)
-    reservations.note_limit(connection, "default", 10_000 if fits else 2_000)
-    plan, warnings = PlanFolder(tmp_path / "plan", ScenePlan("d", options)), list[str]()
-    with plan.claimed("cameras") as run:
-        run.publish({})
-    job = JobFolder(local, JOB, CAPTURE)
-    try:
-        others = OtherWorkers(connection, job, 1, room, warnings.append)
-        others.begin(plan)
-        with plan.claimed("coarse") as run:
+TILES = [entries.unit_id(JOB, 1, tile) for tile in (1, 2)]
+
+
+@pytest.fixture
+def plan(tmp_path: Path) -> PlanFolder:
+    """The folder of the attempt, which has the cameras, and the coarse model in 3 kB."""
+    folder = PlanFolder(tmp_path / "plan", ScenePlan("d", TrainOptions(tiles=2)))
+    for name, size in (("cameras", 1), ("coarse", 3_000)):
+        with folder.claimed(name) as run:
             run.out.mkdir()
             run.out.joinpath("a").write_bytes(b"1")
-            run.out.joinpath("b").write_bytes(bytes(3_000))
+            run.out.joinpath("b").write_bytes(bytes(size))
             run.publish({})
-        before = reservations.used(connection, "default")
-        others.stored(plan.output("coarse"))
-        others.offer(["tile-1", "tile-2"])
-        others.gather(plan)
-    finally:
-        job.remove()
-    names = {entry.path.split("/")[-2].rpartition("-")[0] for entry in local.entries(layout.job_units(JOB))}
-    tiles = [entries.unit_id(JOB, 1, tile) for tile in (1, 2)]
-    assert len(lines.look(connection, tiles).places) == (2 if fits else 0)
-    assert ("coarse" in names) == fits
-    if fits:
-        assert warnings == []
-        return
-    assert reservations.used(connection, "default") == before
+    return folder
+
+
+@pytest.fixture
+def warnings() -> list[str]:
+    return []
+
+
+@pytest.fixture
+def others(
+    local: Storage, connection: redis.Redis, room: Room, warnings: list[str]
+) -> Iterator[OtherWorkers]:
+    write_row(connection, JOB, options=TrainOptions(tiles=2))
+    job = JobFolder(local, JOB, CAPTURE)
+    yield OtherWorkers(connection, job, 1, room, warnings.append)
+    job.remove()
+
+
+def waiting(connection: redis.Redis) -> int:
+    return len(lines.look(connection, TILES).places)
+
+
+def stored(storage: Storage) -> dict[str, int]:
+    """Bytes of each unit in storage, by its name."""
+    sizes: dict[str, int] = {}
+    for entry in storage.entries(layout.job_units(JOB)):
+        name = entry.path.removeprefix(layout.job_units(JOB) + "/").partition("/")[0].rpartition("-")[0]
+        sizes[name] = sizes.get(name, 0) + entry.size
+    return {name: size for name, size in sizes.items() if name}
+
+
+def test_tiles_are_offered_where_their_copies_fit_and_all_copies_are_counted(
+    local: Storage, connection: redis.Redis, others: OtherWorkers, plan: PlanFolder, warnings: list[str]
+) -> None:
+    reservations.note_limit(connection, "default", 10_000)
+    others.begin(plan)
+    others.offer(["tile-1", "tile-2"])
+    assert waiting(connection) == 2
+    sizes = stored(local)
+    assert set(sizes) == {"cameras", "coarse"}
+    assert reservations.used(connection, "default") == sum(sizes.values())
+    assert warnings == []
+
+
+def test_without_room_for_copies_no_tile_is_offered_and_nothing_more_is_stored(
+    local: Storage, connection: redis.Redis, others: OtherWorkers, plan: PlanFolder, warnings: list[str]
+) -> None:
+    reservations.note_limit(connection, "default", 2_000)
+    others.begin(plan)
+    others.offer(["tile-1", "tile-2"])
+    assert waiting(connection) == 0
+    sizes = stored(local)
+    assert set(sizes) == {"cameras"}
+    assert reservations.used(connection, "default") == sizes["cameras"]
     (warning,) = warnings
-    assert warning.startswith("No other worker is given tiles of this job from now on")
-    assert "2 kB in storage, and the job needs 3" in warning
+    assert warning.startswith(
+        "This worker trains all other tiles alone: copies for other workers do not fit."
+    )
+    assert "of 2.0 kB in storage" in warning
+
+
+def test_where_room_ends_tiles_that_nobody_has_begun_are_taken_back_and_those_of_others_are_counted(
+    local: Storage,
+    connection: redis.Redis,
+    others: OtherWorkers,
+    plan: PlanFolder,
+    warnings: list[str],
+    tmp_path: Path,
+) -> None:
+    reservations.note_limit(connection, "default", 10_000)
+    others.begin(plan)
+    others.offer(["tile-1", "tile-2"])
+    elsewhere = PlanFolder(tmp_path / "elsewhere", plan.plan)
+    taken = lines.take(connection, "tester", lines.LINES)
+    assert taken is not None
+    assert taken[0].entry == TILES[0]
+    StoredUnits(local, JOB).bring(elsewhere)
+    with elsewhere.claimed("tile-1") as run:
+        run.out.mkdir()
+        run.out.joinpath("c").write_bytes(bytes(9_000))
+        run.publish({})
+    StoredUnits(local, JOB).put(elsewhere.output("tile-1"))
+    others.gather(plan)
+    assert "tile-1" in plan.states()
+    assert reservations.used(connection, "default") == sum(stored(local).values()) > 10_000
+    assert warnings == []
+    with plan.claimed("tile-2") as run:
+        run.publish({})
+    for _ in range(2):
+        others.stored(plan.output("tile-2"))
+    assert waiting(connection) == 0
+    assert "tile-2" not in stored(local)
+    assert len(warnings) == 1
+    assert others.take_back("tile-2")

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from splatmill.backplane.queue import queue
 from splatmill_worker.errors import QuotaReached
 from splatmill_worker.service.job_folder import JobFolder
 from splatmill_worker.service.redis_patience import patiently
-from splatmill_worker.service.room import Room
+from splatmill_worker.service.room import UNITS, Room
 from splatmill_worker.service.units.stored_units import StoredUnits
 from splatmill_worker.tiles.folder import PlanFolder
 
@@ -24,7 +23,7 @@ class OtherWorkers:
     A tile waits in the queue until a worker takes it, or the attempt takes it back to do it itself. So nobody waits for
     a worker that does not come, and no tile is done by two unless one of them is lost.
 
-    Where the owner's storage has no room for what other workers need, none is given a tile from then on.
+    Where the owner's quota has no room for copies of what they need, no tile is begun by them from then on.
     """
 
     def __init__(
@@ -35,7 +34,7 @@ class OtherWorkers:
         room: Room,
         warn: Callable[[str], None],
     ) -> None:
-        """folder: of the job, on this machine. warn: called with a sentence where there is no room."""
+        """folder: of the job, on this machine. warn: called with sentences where there is no room."""
         self._connection, self._job_id, self._generation = connection, folder.job_id, generation
         self._room, self._job_folder, self._warn = room, folder, warn
         self._alone = False
@@ -55,9 +54,16 @@ class OtherWorkers:
 
     def stored(self, output: Path) -> None:
         """Store the output of a unit, if the owner's storage has room for it."""
-        if not self._alone:
-            with self._alone_without_room():
-                self._units.put(output, self._room.store)
+        if self._alone:
+            return
+        try:
+            self._units.put(output, lambda files: self._room.store(_named(files)))
+        except QuotaReached as error:
+            self._alone = True
+            self.end()
+            self._warn(
+                f"This worker trains all other tiles alone: copies for other workers do not fit. {error}"
+            )
 
     def offer(self, tiles: Sequence[str]) -> None:
         """Put tiles into the queue, each once."""
@@ -74,21 +80,17 @@ class OtherWorkers:
         """Bring the outputs of others into the folder of the plan, and count them for the owner of the job."""
         brought = dict(self._units.bring(folder, check=self._job_folder.check_space))
         if brought:
-            with self._alone_without_room():
-                self._room.store(brought)
+            self._room.store(_named(brought), may_refuse=False)
 
     def end(self) -> None:
         """Take all tiles out of the queue that no worker has begun."""
         for tile in sorted(self._offered):
             patiently(partial(self._on, queue.take_back_tile, tile))
 
-    @contextmanager
-    def _alone_without_room(self) -> Iterator[None]:
-        try:
-            yield
-        except QuotaReached as error:
-            self._alone = True
-            self._warn(f"No other worker is given tiles of this job from now on, since they need copies: {error}")
-
     def _on(self, act: Callable[[redis.Redis, str, int, int], bool], name: str) -> bool:
         return act(self._connection, self._job_id, self._generation, self._numbers[name])
+
+
+def _named(files: Mapping[str, int]) -> dict[str, int]:
+    """Files of units as the room of the job has them."""
+    return {f"{UNITS}/{name}": size for name, size in files.items()}

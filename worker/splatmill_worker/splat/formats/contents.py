@@ -56,12 +56,7 @@ class Contents:
 def visible(gaussians: Gaussians) -> Gaussians:
     """The rows that a file holds, on the CPU as float32: all finite, and of MIN_OPACITY or more."""
     gaussians = gaussians.map(lambda value: value.detach().to("cpu", torch.float32))
-    return gaussians.select(shown(gaussians))
-
-
-def shown(gaussians: Gaussians) -> Tensor:
-    """bool [N]: rows that a file holds, see `visible`."""
-    return gaussians.finite() & (torch.sigmoid(gaussians.logit_opacities.float()) >= MIN_OPACITY)
+    return gaussians.select(gaussians.finite() & (torch.sigmoid(gaussians.logit_opacities) >= MIN_OPACITY))
 
 
 def logits(opacities: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from splatmill_worker.errors import ModelUnreadable
 from splatmill_worker.readers import ply_document
 from splatmill_worker.readers.reader_memory import check_gaussians
 from splatmill_worker.splat.formats import ply_columns, ply_comments
-from splatmill_worker.splat.formats.contents import NO_OFFSET, Contents, Offset, shown, unit, visible
+from splatmill_worker.splat.formats.contents import NO_OFFSET, Contents, Offset, unit, visible
 from splatmill_worker.splat.gaussians import Gaussians
 
 PIECE = 65_536
@@ -53,7 +53,7 @@ def write(
     The file is replaced atomically and synced.
     """
     names = property_names(gaussians.degree if degree is None else degree)
-    n = sum(int(shown(piece).sum()) for piece in _pieces(gaussians, degree))
+    n = sum(visible(piece).count for piece in _pieces(gaussians, degree))
     document = PlyData(
         [PlyElement("vertex", [PlyProperty(name, "float") for name in names], n)],
         byte_order="<",

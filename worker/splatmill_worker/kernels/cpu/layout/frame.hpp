@@ -51,7 +51,7 @@ struct Frame {
   int64_t visible_count = 0;  // that reach a block
   int64_t pairs = 0;
 
-  Buffer<Record> records;  // [count], written where visible
+  Buffer<Record> records;        // [count], written where visible
   Buffer<uint16_t> visible;      // [blocks] one bit per Gaussian
   Buffer<Span> spans;            // [count], written where visible
   Buffer<Touch> touches;         // one stretch per thread, one after the other
