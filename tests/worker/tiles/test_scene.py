@@ -126,10 +126,14 @@ def test_a_tile_goes_on_where_the_coarse_model_stopped(whole: Path) -> None:
         for each, progress in ((plan, 1.0), (last, 0.0))
     )
     assert first_ends == last_begins
+    assert (plan.schedule.annealing.begin, last.schedule.annealing.end) == (0.0, 1.0)
     doubled = replace(coarse, steps=4000)  # the course of a run that was laid out for fewer steps
     for part in (tile_plan(doubled, 500, 11, last=last).schedule for last in (False, True)):
         assert part.budget.steps is not None
         assert part.annealing.boost == boost_of(4000) < boost_of(part.budget.steps)
+    often = tile_plan(replace(coarse, steps=200 * len(coarse.views)), 500, len(coarse.views))
+    assert often.schedule.annealing.begin == pytest.approx(1 - 100 / 400), "all but the last 100 of 400 steps"
+    assert often.schedule.annealing.end == pytest.approx(0.75 + 0.25 * 0.8)
     photos = len(coarse.views)
     each = round(4000 * (photos // 3) / photos)
     third = [tile_plan(doubled, 500, photos // 3, last=last).schedule.budget.steps for last in (False, True)]

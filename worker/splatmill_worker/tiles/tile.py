@@ -28,6 +28,7 @@ from splatmill_worker.splat.plan.budget import Budget
 from splatmill_worker.splat.plan.photos import BYTES_PER_PIXEL, fit_in_memory, statistics_memory
 from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.plan.rates import boost_of
+from splatmill_worker.splat.plan.schedule import MANY_VISITS
 from splatmill_worker.splat.train.loop import Hooks, train
 from splatmill_worker.splat.train.observers import TrainingProgress
 from splatmill_worker.splat.views import TrainingView
@@ -152,7 +153,10 @@ def tile_plan(coarse: Coarse, free: int, photos: int, *, last: bool = False) -> 
 
     Each photo that shows the tile is used as often as in the coarse training, and two steps are taken at least. So a
     Gaussian gets about as many steps as in one piece, however many tiles there are (decisions: tile-steps). No photo is
-    set aside: the coarse model has been trained on all of them, so that they could judge no more.
+    set aside: the coarse model has been trained on all of them, so that they could judge no more. Instead,
+    where both trainings together use a photo more than MANY_VISITS times, a tile takes only the last part of the fall
+    of the rates, MANY_VISITS over that number: what so many steps learn at high rates is rather the photos than the
+    scene (decisions: tile-rates).
     """
     plan, schedule = coarse.plan, coarse.plan.schedule
     until, boost = 1.0 - LAST, schedule.annealing.boost
@@ -160,12 +164,15 @@ def tile_plan(coarse: Coarse, free: int, photos: int, *, last: bool = False) -> 
     total = max(2, round(share * coarse.steps))
     first = max(1, min(total - 1, round(until * total)))
     steps = total - first if last else first
+    earlier = coarse.steps / max(1, len(coarse.views))
+    skipped = max(0.0, 1.0 - MANY_VISITS / (earlier + total / photos))
+    begin, end = (until, 1.0) if last else (0.0, until)
     assert boost is not None
     annealing = replace(
         schedule.annealing,
         boost=min(boost, boost_of(max(1, coarse.steps))),
-        begin=until if last else 0.0,
-        end=1.0 if last else until,
+        begin=skipped + (1.0 - skipped) * begin,
+        end=skipped + (1.0 - skipped) * end,
     )
     most = free if last else max(free, math.ceil(coarse.most * free / max(1, coarse.gaussians.count)))
     return replace(
@@ -189,7 +196,7 @@ def tile_plan(coarse: Coarse, free: int, photos: int, *, last: bool = False) -> 
             resolution=((0, 1),),
             densify_until=min(1.0, schedule.densify_until / until),
             annealing=annealing,
-            earlier_visits=coarse.steps / max(1, len(coarse.views)) + (first / photos if last else 0.0),
+            earlier_visits=earlier + (first / photos if last else 0.0),
         ),
     )
 
