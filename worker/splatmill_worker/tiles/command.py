@@ -288,7 +288,7 @@ def _give_up(folder: PlanFolder, name: str, status: int) -> None:
         ended = "its process was killed, most often because memory ran out"
         advice = "Use more tiles, a smaller image_size or fewer max_gaussians, or a machine with more memory."
     else:
-        ended = f"its process ended with status {status}"
+        ended = f"its process ended with status {status}" if status else "its process ended without doing it"
         advice = f"splatmill unit {folder.root} {name} does it alone, and shows why."
     with suppress(Claimed), folder.claimed(name) as run:
         if name not in folder.states():

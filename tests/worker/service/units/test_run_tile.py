@@ -61,7 +61,7 @@ def test_a_failure_with_a_name_leaves_the_tile_to_the_attempt(
     monkeypatch.setenv("SPLATMILL_DISK_RESERVE", "1000TB")
     with caplog.at_level(logging.WARNING, "splatmill.attempt"):
         run_tile(entry)
-    assert "failed here" in caplog.text
+    assert "tile-1 of the job job00001 failed here" in caplog.text
     assert "stay free" in caplog.text
 
 

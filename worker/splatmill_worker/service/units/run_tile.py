@@ -25,6 +25,7 @@ from splatmill_worker.service.redis_patience import patiently
 from splatmill_worker.service.units.stored_units import StoredUnits
 from splatmill_worker.settings import storage_url
 from splatmill_worker.tiles.folder import PlanFolder
+from splatmill_worker.tiles.units import ScenePlan
 
 POLL_SECONDS = 0.5
 """Seconds between two questions whether the job still runs."""
@@ -73,10 +74,15 @@ def run_tile(entry: TileEntry) -> None:
         error = disk.error or caught
         if not isinstance(error, WorkerError):
             raise
-        log.warning("unit %d of the job %s failed here: %s", entry.tile, entry.job_id, error)
+        log.warning("%s of the job %s failed here: %s", _name(entry, row), entry.job_id, error)
     finally:
         watch.close()
         disk.close()
+
+
+def _name(entry: TileEntry, row: JobRow) -> str:
+    """The name of the unit."""
+    return ScenePlan("", row.options).part_names[entry.tile - 1]
 
 
 def _train(entry: TileEntry, row: JobRow, stopped: Callable[[], bool]) -> None:
