@@ -10,7 +10,6 @@ import threading
 import time
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
 from pathlib import Path
 
 import psutil
@@ -32,7 +31,7 @@ from splatmill_worker.service.attempts.problems import is_transient, keeps_progr
 from splatmill_worker.service.attempts.publish import publish
 from splatmill_worker.service.job_folder import JobFolder
 from splatmill_worker.service.lock import JobLock
-from splatmill_worker.service.room import UNITS, Room
+from splatmill_worker.service.room import Room
 from tests.support.jobs import CAPTURE, write_row
 from tests.support.redis_server import RedisServer
 from tests.support.up import running_worker, worker_environment
@@ -91,22 +90,6 @@ def test_a_restarted_job_needs_room_for_what_it_adds_only(
     assert reservations.used(connection, "default") == 90_000
     with pytest.raises(QuotaReached):
         room.store_all({"model.ply": 100_001})
-
-
-@pytest.mark.parametrize(("size", "fits"), [(20_000, True), (60_000, False)])
-def test_copies_for_other_workers_make_room_for_the_model_where_that_is_enough(
-    local: Storage, connection: redis.Redis, limited: int, room: Room, tmp_path: Path, size: int, fits: bool
-) -> None:
-    room.store({f"{UNITS}/coarse/a": 60_000})
-    local.put(f"{layout.job_units(JOB)}/coarse/a", bytes(60_000))
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "model.ply").write_bytes(bytes(size))
-    attempt = Attempt(connection, JOB, 1, 1, JobLock(connection, JOB, "token"))
-    row = write_row(connection, JOB)
-    with nullcontext() if fits else pytest.raises(QuotaReached):
-        publish(local, attempt, row, tmp_path / "out", room)
-    assert local.exists(layout.model_file(JOB, "model.ply")) == fits
-    assert bool(list(local.entries(layout.job_units(JOB)))) != fits
 
 
 def test_a_checkpoint_without_room_is_reported_and_not_copied(

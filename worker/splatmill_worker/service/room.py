@@ -11,9 +11,6 @@ from splatmill.backplane.reservations import NoRoom
 from splatmill_worker.errors import QuotaReached
 from splatmill_worker.service.redis_patience import patiently
 
-UNITS = "units"
-"""Folder in the names of files that are copies for other workers."""
-
 
 class Room:
     """The room of one job, as one of its attempts uses it. The server ends the reservation when the job has ended.
@@ -51,16 +48,6 @@ class Room:
             together = {**self._stored, **files}
             patiently(lambda: self._reserve(reservations.job(self._job_id), sum(together.values())))
             self._stored = together
-
-    def of_units(self) -> int:
-        """Bytes of the copies for other workers, below UNITS."""
-        with self._lock:
-            return sum(size for name, size in self._stored.items() if name.startswith(f"{UNITS}/"))
-
-    def forget_units(self) -> None:
-        """Enter that the copies for other workers are no longer stored."""
-        with self._lock:
-            self._stored = {name: n for name, n in self._stored.items() if not name.startswith(f"{UNITS}/")}
 
     def unpack(self, name: str, size: int, may_refuse: bool = True) -> None:
         """Reserve the bytes that a folder takes on this machine's disk; without `may_refuse`, only count them.

@@ -96,7 +96,7 @@ def test_without_room_for_copies_no_tile_is_offered_and_nothing_more_is_stored(
     assert reservations.used(connection, "default") == sizes["cameras"]
     (warning,) = warnings
     assert warning.startswith(
-        "This worker trains all other tiles alone: copies for other workers do not fit."
+        "This worker trains all tiles that no other has begun: copies for other workers do not fit."
     )
     assert "of 2.0 kB in storage" in warning
 

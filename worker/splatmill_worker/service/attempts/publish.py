@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-from collections.abc import Mapping
 from pathlib import Path
 
 from splatmill.backplane import lists
@@ -13,7 +12,6 @@ from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.records import FORMAT
 from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import POSTER, JobState
-from splatmill_worker.errors import QuotaReached
 from splatmill_worker.service.attempts.attempt import Attempt
 from splatmill_worker.service.redis_patience import patiently
 from splatmill_worker.service.room import Room
@@ -42,7 +40,7 @@ def publish(storage: Storage, attempt: Attempt, row: JobRow, out: Path, room: Ro
         raise FileNotFoundError(f"The pipeline ended without writing {out / 'model.ply'}.")
     names = [*layout.MODEL_FILES, *_in_folders(out)]
     sizes = {name: path.stat().st_size for name in names if (path := out / name).is_file()}
-    _reserve(storage, attempt.job_id, room, sizes | {_RECORD: RECORD_BYTES + 100 * len(sizes)})
+    room.store_all(sizes | {_RECORD: RECORD_BYTES + 100 * len(sizes)})
     storage.delete(layout.job_record(attempt.job_id))
     patiently(lambda: lists.remove_model(attempt.connection, attempt.job_id, row.owner))
     digests: dict[str, str] = {}
@@ -82,17 +80,3 @@ def publish(storage: Storage, attempt: Attempt, row: JobRow, out: Path, room: Ro
     storage.put(layout.job_record(attempt.job_id), json.dumps(record, indent=1).encode())
     # A worker that is killed here leaves it to the server, which sees the end of the job.
     patiently(lambda: lists.add_model(attempt.connection, attempt.job_id, finished_at, row.owner))
-
-
-def _reserve(storage: Storage, job_id: str, room: Room, sizes: Mapping[str, int]) -> None:
-    """Reserve the bytes of the model. Copies for other workers, which are needed no longer, go where that is enough."""
-    try:
-        room.store_all(sizes)
-    except QuotaReached as error:
-        copies = room.of_units()
-        if not copies or error.used + error.size - copies > error.limit:
-            raise
-        for entry in storage.entries(layout.job_units(job_id)):
-            storage.delete(entry.path)
-        room.forget_units()
-        room.store_all(sizes)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from splatmill.backplane.queue import queue
 from splatmill_worker.errors import QuotaReached
 from splatmill_worker.service.job_folder import JobFolder
 from splatmill_worker.service.redis_patience import patiently
-from splatmill_worker.service.room import UNITS, Room
+from splatmill_worker.service.room import Room
 from splatmill_worker.service.units.stored_units import StoredUnits
 from splatmill_worker.tiles.folder import PlanFolder
 
@@ -57,12 +57,12 @@ class OtherWorkers:
         if self._alone:
             return
         try:
-            self._units.put(output, lambda files: self._room.store(_named(files)))
+            self._units.put(output, self._room.store)
         except QuotaReached as error:
             self._alone = True
             self.end()
             self._warn(
-                f"This worker trains all other tiles alone: copies for other workers do not fit. {error}"
+                f"This worker trains all tiles that no other has begun: copies for other workers do not fit. {error}"
             )
 
     def offer(self, tiles: Sequence[str]) -> None:
@@ -80,7 +80,7 @@ class OtherWorkers:
         """Bring the outputs of others into the folder of the plan, and count them for the owner of the job."""
         brought = dict(self._units.bring(folder, check=self._job_folder.check_space))
         if brought:
-            self._room.store(_named(brought), may_refuse=False)
+            self._room.store(brought, may_refuse=False)
 
     def end(self) -> None:
         """Take all tiles out of the queue that no worker has begun."""
@@ -89,8 +89,3 @@ class OtherWorkers:
 
     def _on(self, act: Callable[[redis.Redis, str, int, int], bool], name: str) -> bool:
         return act(self._connection, self._job_id, self._generation, self._numbers[name])
-
-
-def _named(files: Mapping[str, int]) -> dict[str, int]:
-    """Files of units as the room of the job has them."""
-    return {f"{UNITS}/{name}": size for name, size in files.items()}
