@@ -248,7 +248,6 @@ class QuotaReached(WorkerError):
     """
 
     def __init__(self, owner: str, used: int, limit: int, size: int) -> None:
-        self.used, self.limit, self.size = used, limit, size
         super().__init__(
             "quota_exceeded",
             f"The owner {owner} has {format_bytes(used)} of {format_bytes(limit)} in storage, and the job needs "

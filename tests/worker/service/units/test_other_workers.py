@@ -25,8 +25,6 @@ from splatmill_worker.tiles.units import ScenePlan
 from tests.support.jobs import CAPTURE, write_row
 
 JOB = "job00001"
-
-
 TILES = [entries.unit_id(JOB, 1, tile) for tile in (1, 2)]
 
 
