@@ -474,20 +474,49 @@ SECONDS_LEFT = """async ([at, spent, eta, stage, estimate]) => {
 
 
 def test_a_number_of_steps_that_is_a_bound_is_called_one(page: Page) -> None:
-    said = """async (note) => {
+    said = """async ([at_most, note]) => {
         const { Course } = await import("/page/any/job/course.js");
         const { showTimeline } = await import("/page/any/job/timeline.js");
         const course = new Course(), list = document.createElement("ol"), at = new Date(1e12).toISOString();
-        const progress = { type: "progress", stage: "training", done: 1200, total: 4000, eta: 20, note };
+        const progress = { type: "progress", stage: "training", done: 1200, total: 4000, eta: 20, at_most, note };
         for (const event of [{ type: "state", state: "training" }, progress]) course.apply({ event, at, attempt: 1 });
         showTimeline(list, course, 1e12);
         return list.querySelector(".stage-now p").textContent;
     }"""
     page.goto("/glossary")
-    whole = page.evaluate(said, None)
-    assert (whole.count("about"), whole.count("at most")) == (2, 0)
-    bound = page.evaluate(said, "or fewer, where more gain too little")
+    whole = page.evaluate(said, [None, "tile 1 of 4"])
+    assert (whole.count("about"), whole.count("at most"), "tile 1 of 4" in whole) == (2, 0, True)
+    bound = page.evaluate(said, [True, None])
     assert (bound.count("about"), bound.count("at most")) == (0, 2)
+
+
+def test_the_units_of_a_scene_in_tiles_are_counted_by_kind(page: Page) -> None:
+    rows = """async (events) => {
+        const { Course } = await import("/page/any/job/course.js");
+        const { unitParts } = await import("/page/any/job/units.js");
+        const course = new Course(), at = new Date(1e12).toISOString();
+        for (const event of events) course.apply({ event: { type: "unit", tiles: 9, ...event }, at, attempt: 1 });
+        const lines = [...unitParts(course.units).querySelectorAll("tbody tr")];
+        return lines.map((line) => [...line.children].map((cell) => cell.textContent));
+    }"""
+    page.goto("/glossary")
+    done = [("cameras", 4, None), ("coarse", 8, 500), ("tile-1", 2, 1000), ("tile-7", 4, 2000)]
+    events: list[dict[str, Any]] = [{"unit": "tile-1", "state": "running"}]
+    events += [{"unit": unit, "state": "done", "seconds": s, "gaussians": n} for unit, s, n in done]
+    events += [{"unit": "tile-2", "state": "running"}, {"unit": "tile-9", "state": "failed"}]
+    events += [{"unit": f"tile-{number}", "state": "elsewhere"} for number in (3, 4)]
+    assert page.evaluate(rows, events) == [
+        ["Cameras", "✓", "", "", "4.0 s"],
+        ["Coarse model", "✓", "", "500", "8.0 s"],
+        ["Tiles", "2 of 9", "2; 3, 4 on other workers; 9 failed", "3,000", "3.0 s"],
+        ["Last steps of tiles", "0 of 9", "", "", ""],
+        ["Whole scene", "", "", "", ""],
+    ]
+    many = [{"unit": f"seam-{number}", "state": "elsewhere"} for number in range(1, 8)]
+    assert page.evaluate(rows, [*many, {"unit": "scene", "state": "running"}])[3:] == [
+        ["Last steps of tiles", "0 of 9", "7 tiles on other workers", "", ""],
+        ["Whole scene", "", "yes", "", ""],
+    ]
 
 
 @pytest.mark.parametrize(

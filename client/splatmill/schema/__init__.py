@@ -170,6 +170,7 @@ if TYPE_CHECKING:  # `as` exports a name to type checkers
         ProgressEvent as ProgressEvent,
         SnapshotEvent as SnapshotEvent,
         StateEvent as StateEvent,
+        UnitEvent as UnitEvent,
     )
     from splatmill.schema.resources.jobs.jobs import (
         IDEMPOTENCY_HEADER as IDEMPOTENCY_HEADER,

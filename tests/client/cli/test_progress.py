@@ -57,6 +57,10 @@ def test_the_last_progress_before_a_pause_is_printed_during_it(capsys: pytest.Ca
         (Progress(stage="uploading", done=1500, total=2_000_000), "uploading  1.5 kB/2.0 MB"),
         (Progress(stage="matching", done=7), "matching  7"),
         (Progress(stage="waiting"), "waiting"),
+        (
+            Progress(stage="training", done=3, total=9, at_most=True, note="coarse model"),
+            "training  3/9  or fewer, where more gain too little  coarse model",
+        ),
         (Progress(stage="training", loss=0.5, eta=-1.0), "training  loss 0.5000  ETA 0.0s"),
     ],
 )

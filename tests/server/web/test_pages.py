@@ -10,15 +10,19 @@ import base64
 import hashlib
 import json
 import re
+from typing import get_args
 from urllib.parse import urljoin
 
 import httpx
 import pytest
 
+from splatmill.schema import Event
 from splatmill_server.web import pages
 from splatmill_server.web.tree import Tree
 from tests.support.paths import ROOT
 from tests.support.served_app import Serve, ServedApp, problem
+
+PAGE = ROOT / "server/splatmill_server/web/page"
 
 PAGES = (
     "/",
@@ -182,3 +186,9 @@ def test_people_see_a_page_at_an_unknown_address_and_programs_a_problem(serve: S
         led = stranger.get("/nothing/here", headers=browser)
         assert (led.status_code, led.headers["location"]) == (303, "/sign-in?next=/nothing/here")
         problem(stranger.get("/v1/models", headers=browser), 401, "unauthorized")
+
+
+def test_the_page_listens_to_all_events_of_a_job() -> None:
+    (listed,) = re.findall(r"const types = (\[.*\]);", (PAGE / "api.js").read_text())
+    kinds = [get_args(kind.model_fields["type"].annotation) for kind in get_args(get_args(Event)[0])]
+    assert sorted(json.loads(listed)) == sorted(name for (name,) in kinds)

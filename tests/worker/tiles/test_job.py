@@ -23,6 +23,7 @@ from splatmill.schema import (
     ProgressEvent,
     StateEvent,
     TrainOptions,
+    UnitEvent,
 )
 from splatmill_worker.pipeline import Outcome
 from splatmill_worker.tiles import job
@@ -114,6 +115,17 @@ def test_units_are_done_in_order_and_stored_and_those_of_others_are_waited_for(t
         JobState.training,
         JobState.exporting,
     ]
+    told = [event for event in events if isinstance(event, UnitEvent)]
+    both = ("running", "done")
+    assert [(event.unit, event.state) for event in told] == [
+        *((unit, state) for unit in ("cameras", "coarse", "tile-1") for state in both),
+        *(("tile-2", state) for state in ("elsewhere", "done")),
+        *((unit, state) for unit in ("seam-1", "seam-2", "scene") for state in both),
+    ]
+    assert {event.tiles for event in told} == {2}
+    for event in told:
+        assert (event.seconds is not None) == (event.state == "done")
+        assert (event.gaussians is not None) == (event.state == "done" and event.unit != "cameras")
     notes = {event.note for event in events if isinstance(event, ProgressEvent)}
     assert "tile 1 of 2" in notes
     assert "seam 2 of 2" in notes
@@ -136,6 +148,8 @@ def test_a_failed_tile_is_said_and_the_scene_is_made_without_it(tmp_path: Path) 
     assert any("Tile 1 of 2 failed" in message and "Nothing shows it." in message for message in said)
     report = json.loads((outcome.out / "report.json").read_text())
     assert any("Tile 1 of 2 failed" in warning for warning in report["warnings"])
+    told = [event.state for event in events if isinstance(event, UnitEvent) and event.unit == "tile-1"]
+    assert told == ["failed"]
     assert others.offered == ["tile-1", "tile-2"], "nobody else knows that tile 1 failed"
     assert not any("0 Gaussians" in event.message for event in events if isinstance(event, LogEvent))
     assert report["curve"][-1]["step"] == 50 + 50

@@ -18,9 +18,6 @@ from splatmill_worker.splat.views import TrainingView
 
 Emit = Callable[[Event], None]
 
-AT_MOST = "or fewer, where more gain too little"
-"""Note of a training whose number of steps is a bound."""
-
 
 def progress_events(emit: Emit) -> Callable[[str, int, int, str], None]:
     """A callback (stage, done, total, note) that emits each call as a progress event, with its seconds left."""
@@ -66,7 +63,7 @@ class TrainingEvents:
                 gaussians=progress.gaussians,
                 seconds=progress.seconds,
                 eta=progress.eta,
-                note=AT_MOST if progress.at_most else None,
+                at_most=progress.at_most or None,
             )
         )
 

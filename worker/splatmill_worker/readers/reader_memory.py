@@ -9,7 +9,8 @@ from splatmill.schema.quantities import format_bytes
 from splatmill_worker import memory
 
 COPIES = 7
-"""Times the memory of the parameters that a reader of models takes at its peak, at most; a test measures each."""
+"""Times the memory of the parameters that a reader of models takes at its peak, at most, unless it names another
+number; a test measures each."""
 
 FREE_BYTES = 128 * 2**20
 """Any file may take this much."""
@@ -46,7 +47,10 @@ def check(what: str, needed: int, size: int) -> None:
         )
 
 
-def check_gaussians(count: int, degree: int, size: int) -> None:
-    """Raise ValueError if a file of `size` bytes may not hold so many Gaussians with harmonics of `degree`."""
+def check_gaussians(count: int, degree: int, size: int, copies: int = COPIES) -> None:
+    """Raise ValueError if a file of `size` bytes may not hold so many Gaussians with harmonics of `degree`.
+
+    copies: times the memory of the parameters that the reader takes.
+    """
     parameters = 4 * (11 + 3 * (degree + 1) ** 2)
-    check(f"reading its {count:,} Gaussians", COPIES * parameters * count, size)
+    check(f"reading its {count:,} Gaussians", copies * parameters * count, size)

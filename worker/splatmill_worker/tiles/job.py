@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Literal, Protocol
 
 from splatmill.schema import (
     CamerasEvent,
@@ -20,6 +20,7 @@ from splatmill.schema import (
     ProgressEvent,
     StateEvent,
     TrainOptions,
+    UnitEvent,
 )
 from splatmill.schema.quantities import listed
 from splatmill_worker.errors import Cancelled, TrainingFailed, WorkerError
@@ -39,6 +40,10 @@ WAIT_SECONDS = 1.0
 
 STATES = {"cameras": JobState.sfm, "scene": JobState.exporting}
 """The state that a job enters with a unit; with every other unit, it is `training`."""
+
+
+UNIT_FACTS = ("seconds", "photos", "gaussians")
+"""Facts of a unit that its event has."""
 
 
 class Others(Protocol):
@@ -97,6 +102,18 @@ class _Work:
     looks: Looks | None
     others: Others
     entered: list[JobState] = field(default_factory=list)
+    told: dict[str, str] = field(default_factory=dict)
+
+    def tell(self, name: str, state: Literal["running", "elsewhere", "done", "failed"]) -> None:
+        """Emit the state of a unit, with its facts where it is done, unless it was told."""
+        if self.told.get(name) == state:
+            return
+        self.told[name] = state
+        facts: dict[str, Any] = {}
+        path = self.folder.ended()[name].path if state == "done" else None
+        if path is not None:
+            facts = {key: value for key, value in facts_of(path).items() if key in UNIT_FACTS}
+        self.emit(UnitEvent(unit=name, state=state, tiles=self.folder.plan.tiles, **facts))
 
 
 def run(
@@ -147,13 +164,20 @@ def _step(work: _Work) -> None:
         raise Cancelled
     folder, others = work.folder, work.others
     states = folder.states()
+    for name, state in states.items():
+        work.tell(name, state)
     ready = folder.plan.ready(states)
     tiles = [name for name in ready if name in folder.plan.part_names]
     # What failed here is not known elsewhere: the last steps beside a tile that failed are left to this process.
     offered = [name for name in tiles if "failed" not in map(states.get, folder.plan.unit(name).needs)]
     if offered:
         others.offer(offered)
-    free = next((name for name in ready if name not in tiles or others.take_back(name)), None)
+    free = None
+    for name in ready:
+        if name not in tiles or others.take_back(name):
+            free = name
+            break
+        work.tell(name, "elsewhere")
     others.gather(folder)  # what has ended since
     if free is None:
         _wait(work, tiles)
@@ -168,6 +192,7 @@ def _do(work: _Work, name: str) -> None:
     if state not in work.entered:
         work.entered.append(state)
         work.emit(StateEvent(state=state))
+    work.tell(name, "running")
     with folder.claimed(name) as run:
         context = Context(
             folder,
@@ -187,8 +212,10 @@ def _do(work: _Work, name: str) -> None:
                 raise
             run.fail(error.message, error.advice or "")
             work.emit(LogEvent(level="warning", message=f"{name} failed: {error}"))
+            work.tell(name, "failed")
             return
     return_freed()
+    work.tell(name, "done")
     if name != "scene":
         work.others.stored(run.path)
     if name == "cameras" and (run.path / SFM).is_dir():

@@ -31,6 +31,7 @@ from splatmill.schema import (
     ProgressEvent,
     SnapshotEvent,
     StateEvent,
+    UnitEvent,
 )
 from splatmill.schema.tolerant import keep_readable
 
@@ -116,6 +117,8 @@ def stream_of(event: Event) -> Callable[[str], str]:
             return keys.states
         case LogEvent():
             return keys.warnings if event.level in ("warning", "error") else keys.log
+        case UnitEvent():
+            return keys.log
         case MetricEvent():
             return keys.curve
         case ProgressEvent() | PreviewEvent() | CamerasEvent() | SnapshotEvent():

@@ -56,6 +56,7 @@ def progress_text(progress: Progress) -> str:
     parts = [
         progress.stage,
         count_text(progress) if progress.done or progress.total else "",
+        "or fewer, where more gain too little" if progress.at_most else "",
         progress.note or "",
     ]
     return "  ".join(part for part in [*parts, measurements(progress)] if part)

@@ -195,7 +195,7 @@ const REOPEN_MS = 3000;
  * @returns {{close: () => void}}
  */
 export function follow(jobId, onRecord, onConnection = () => {}, onAnew = () => {}) {
-  const types = ["state", "progress", "metric", "plan", "preview", "log", "cameras", "snapshot"];
+  const types = ["state", "progress", "metric", "plan", "preview", "log", "cameras", "snapshot", "unit"];
   /** @type {EventSource} */
   let source;
   /** @type {ReturnType<typeof setTimeout> | undefined} */

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import torch
@@ -48,15 +49,52 @@ class Contents:
         lost = gaussians.count - int(keep.sum())
         if lost:
             gaussians = gaussians.select(keep)
-            unfit = "Gaussians with a value that is not finite, or a quaternion of zeros, are left out"
-            notes = (*notes, f"{unfit}: {lost} of {len(keep)}.")
-        return Contents(gaussians, offset, antialiased, notes)
+        return Contents(gaussians, offset, antialiased, (*notes, *left_out(lost, len(keep))))
+
+
+def left_out(lost: int, count: int) -> tuple[str, ...]:
+    """The note on rows that are left out, if there are any."""
+    unfit = "Gaussians with a value that is not finite, or a quaternion of zeros, are left out"
+    return (f"{unfit}: {lost} of {count}.",) if lost else ()
 
 
 def visible(gaussians: Gaussians) -> Gaussians:
     """The rows that a file holds, on the CPU as float32: all finite, and of MIN_OPACITY or more."""
-    gaussians = gaussians.map(lambda value: value.detach().to("cpu", torch.float32))
-    return gaussians.select(gaussians.finite() & (torch.sigmoid(gaussians.logit_opacities) >= MIN_OPACITY))
+    gaussians = on_cpu(gaussians)
+    return gaussians.select(visible_rows(gaussians))
+
+
+def on_cpu(gaussians: Gaussians) -> Gaussians:
+    """The Gaussians as float32 on the CPU, without gradients; a copy where they are not."""
+    return gaussians.map(lambda value: value.detach().to("cpu", torch.float32))
+
+
+def visible_rows(gaussians: Gaussians) -> Tensor:
+    """bool [N]: the rows that a file holds, of float32 on the CPU."""
+    return gaussians.finite() & (torch.sigmoid(gaussians.logit_opacities) >= MIN_OPACITY)
+
+
+def gathered(count: int, degree: int, pieces: Iterable[Gaussians]) -> Gaussians:
+    """The rows of pieces of float32, one after the other. A piece is copied, and freed where nothing else holds it.
+
+    count: rows of all pieces at most. degree: that of the result.
+    """
+    shapes = {
+        "means": (3,),
+        "log_scales": (3,),
+        "quats": (4,),
+        "logit_opacities": (),
+        "sh": ((degree + 1) ** 2, 3),
+    }
+    whole = Gaussians(**{name: torch.empty(count, *shape) for name, shape in shapes.items()})
+    end = 0
+    for piece in pieces:
+        first, end = end, end + piece.count
+        for target, values in zip(whole, piece.padded(degree), strict=True):
+            target[first:end].numpy()[...] = (
+                values.numpy()
+            )  # by one thread: those of torch wait for each other
+    return whole.select(slice(end))
 
 
 def logits(opacities: Tensor) -> Tensor:

@@ -5,19 +5,30 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import torch
 from plyfile import PlyData, PlyElement, PlyParseError, PlyProperty
 
 from splatmill.files import replacing
 from splatmill_worker.errors import ModelUnreadable
-from splatmill_worker.readers import ply_document
-from splatmill_worker.readers.reader_memory import check_gaussians
+from splatmill_worker.readers import ply_document, reader_memory
 from splatmill_worker.splat.formats import ply_columns, ply_comments
-from splatmill_worker.splat.formats.contents import NO_OFFSET, Contents, Offset, unit, visible
+from splatmill_worker.splat.formats.contents import (
+    NO_OFFSET,
+    Contents,
+    Offset,
+    gathered,
+    left_out,
+    unit,
+    visible,
+)
 from splatmill_worker.splat.gaussians import Gaussians
 
-PIECE = 65_536
-"""Gaussians that are written at a time, so that memory holds no second model."""
+PIECE = 16_384
+"""Gaussians that are read or written at a time, so that memory holds no second model."""
+
+COPIES = 3
+"""Times the memory of the parameters that `read` takes of a binary file: they, and the file that is mapped."""
 
 COMPRESSED_ELEMENTS = ("chunk", "sh")
 """Elements of a compressed .ply besides its vertices."""
@@ -111,23 +122,48 @@ def decode(path: Path, document: PlyData) -> Contents:
         raise ModelUnreadable(
             f"{path.name} has {rest} f_rest properties; SH degrees 0 to 4 have 0, 9, 24, 45 or 72."
         )
-    check_count(path, vertex.count, degree)
+    check_count(path, vertex.count, degree, reader_memory.COPIES if document.text else COPIES)
+    notes = dict[str, None]()
+
+    def pieces() -> Iterator[Gaussians]:
+        for first in range(0, max(1, vertex.count), PIECE):
+            rows = PlyElement.describe(vertex.data[first : first + PIECE], "vertex")
+            gaussians, said = ply_columns.gaussians_of(rows)
+            notes.update(dict.fromkeys(said))
+            yield _finite(gaussians)
+
     try:
-        gaussians, notes = ply_columns.gaussians_of(vertex)
+        gaussians = gathered(vertex.count, min(degree, 3), pieces())
     except ValueError as error:
         raise ModelUnreadable(f"{path.name} is not a 3D Gaussian .ply: {error}.") from error
-    return Contents.of(
+    return Contents(
         gaussians,
         ply_comments.offset_of(path, document),
         ply_comments.antialiased_of(document),
-        (*notes, *ply_comments.unknown_modes(document)),
+        (
+            *notes,
+            *left_out(vertex.count - gaussians.count, vertex.count),
+            *ply_comments.unknown_modes(document),
+        ),
     )
 
 
-def check_count(path: Path, count: int, degree: int) -> None:
-    """Raise ModelUnreadable for more Gaussians than the file, or the memory, can hold."""
+def _finite(piece: Gaussians) -> Gaussians:
+    """The rows of `Gaussians.finite`, found by NumPy: in each operation on a piece, the threads of torch would wait."""
+    values = [value.numpy() for value in piece]
+    keep = np.linalg.norm(piece.quats.numpy(), axis=1) > 0
+    for value in values:
+        keep &= np.isfinite(value).all(axis=tuple(range(1, value.ndim)))
+    return piece if keep.all() else Gaussians(*(torch.from_numpy(value[keep]) for value in values))
+
+
+def check_count(path: Path, count: int, degree: int, copies: int = reader_memory.COPIES) -> None:
+    """Raise ModelUnreadable for more Gaussians than the file, or the memory, can hold.
+
+    copies: times the memory of the parameters that reading takes.
+    """
     try:
-        check_gaussians(count, degree, path.stat().st_size)
+        reader_memory.check_gaussians(count, degree, path.stat().st_size, copies)
     except ValueError as error:
         raise ModelUnreadable(f"{path.name} could not be read as a .ply file: {error}.") from error
 

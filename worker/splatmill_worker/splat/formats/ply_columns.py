@@ -71,16 +71,18 @@ def gaussians_of(vertex: PlyElement) -> tuple[Gaussians, tuple[str, ...]]:
         thin = log_scales.amin(dim=1, keepdim=True) + math.log(FLATNESS)
         log_scales = torch.cat([log_scales, thin], dim=1)
     dc = (_shown(vertex) - 0.5) / SH_C0 if by_channel else _columns(vertex, colors)
-    sh = [dc[:, None]]
-    if names := kept_rest(rest):
-        sh.append(_columns(vertex, names).reshape(vertex.count, 3, len(names) // 3).transpose(1, 2))
+    names = kept_rest(rest)
+    sh = np.empty((vertex.count, 1 + len(names) // 3, 3), np.float32)
+    sh[:, 0] = dc.numpy()
+    for place, name in enumerate(names):
+        sh[:, 1 + place % (len(names) // 3), place // (len(names) // 3)] = vertex[name]
     gaussians = Gaussians(
         means=_columns(vertex, ("x", "y", "z")),
         log_scales=log_scales,
         quats=_columns(vertex, quats),
         # Some tools write an opacity of exactly 1 or 0 as its infinite logit.
         logit_opacities=_columns(vertex, ("opacity",))[:, 0].contiguous().clamp(-OPAQUE, OPAQUE),
-        sh=torch.cat(sh, dim=1),
+        sh=torch.from_numpy(sh),
     )
     return gaussians, notes
 

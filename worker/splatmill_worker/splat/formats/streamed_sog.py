@@ -7,20 +7,30 @@ surroundings of a scene are its `environment`, which stands outside of the tree,
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import accumulate
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from splatmill.files import atomic_write
 from splatmill_worker.errors import ModelUnreadable
 from splatmill_worker.splat.formats import sog
-from splatmill_worker.splat.formats.contents import NO_OFFSET, Contents, Offset, visible
+from splatmill_worker.splat.formats.contents import (
+    NO_OFFSET,
+    Contents,
+    Offset,
+    gathered,
+    on_cpu,
+    visible_rows,
+)
 from splatmill_worker.splat.gaussians import Gaussians, concatenate
 from splatmill_worker.splat.lod.boxes import leaf_boxes
-from splatmill_worker.splat.lod.levels import Level, Levels, make_levels
+from splatmill_worker.splat.lod.levels import Divided, Levels, divided
 from splatmill_worker.splat.lod.partition import Node
 from splatmill_worker.wording import plain
 
@@ -37,19 +47,6 @@ MAX_INDEX_BYTES = 2**23
 """Bytes of a `lod-meta.json`, of which a leaf takes some 400; Python takes up to thirty times as many to parse it."""
 
 
-@dataclass(frozen=True)
-class Chunk:
-    """Runs of neighbouring leaves in a level, which lie in one SOG.
-
-    level: 0 is the finest.
-    first, last: its leaves are those from `first` to before `last`.
-    """
-
-    level: int
-    first: int
-    last: int
-
-
 def write(path: Path, gaussians: Gaussians, *, offset: Offset = NO_OFFSET, antialiased: bool = False) -> int:
     """Make the levels of `gaussians` and write them beside `path`, a `lod-meta.json`; returns how many level 0 has.
 
@@ -58,14 +55,21 @@ def write(path: Path, gaussians: Gaussians, *, offset: Offset = NO_OFFSET, antia
 
     An index that is there is removed first and the new one is written last, so that none names files of another model.
     """
-    gaussians = visible(gaussians)
-    write_levels(path, make_levels(gaussians), offset=offset, antialiased=antialiased)
-    return gaussians.count
+    model, count = divided_visible(gaussians)
+    write_levels(path, model, offset=offset, antialiased=antialiased)
+    return count
+
+
+def divided_visible(gaussians: Gaussians) -> tuple[Divided, int]:
+    """The rows of a model that a file holds, for `encoded`, and how many they are."""
+    gaussians = on_cpu(gaussians)
+    rows = visible_rows(gaussians)
+    return divided(gaussians, rows), int(rows.sum())
 
 
 def write_levels(
     path: Path,
-    levels: Levels,
+    levels: Levels | Divided,
     *,
     offset: Offset = NO_OFFSET,
     antialiased: bool = False,
@@ -78,25 +82,83 @@ def write_levels(
 
 
 def encoded(
-    levels: Levels,
+    levels: Levels | Divided,
     *,
     offset: Offset = NO_OFFSET,
     antialiased: bool = False,
     chunk: int = CHUNK,
 ) -> Iterator[tuple[str, bytes]]:
-    """The files of a model by their paths: those of each chunk together, and the index last. Else as `write_levels`."""
-    chunks = [part for number, level in enumerate(levels.levels) for part in _chunks(number, level, chunk)]
-    names, places = list[str](), dict[int, int]()
-    for part in chunks:
-        number = places[part.level] = places.get(part.level, -1) + 1
-        names.append(f"{part.level}_{number}/meta.json")
-        level = levels.levels[part.level]
-        begin, end = level.runs[part.first].first, level.runs[part.last - 1]
-        rows = torch.arange(begin, end.first + end.count)
-        yield from _sog(names[-1], level.gaussians.select(rows), offset, antialiased)
+    """The files of a model by their paths: those of each chunk together, and the index last. Else as `write_levels`.
+
+    A chunk is written as soon as it is full, so that memory holds at most one of each level beside a part of `levels`.
+    """
+    chunks, boxes, counts = list[_Chunks](), list[Tensor](), Counter[int]()
+    for part in levels.parts():
+        boxes.append(leaf_boxes(part))
+        chunks = chunks or [_Chunks(number, chunk) for number in range(len(part))]
+        for number, (level, waiting) in enumerate(zip(part, chunks, strict=True)):
+            counts[number] += level.gaussians.count
+            for run, error in zip(level.runs, level.errors, strict=True):
+                if not waiting.has_room(run.count):
+                    yield from _sog(waiting.name, waiting.take(), offset, antialiased)
+                waiting.add(level.gaussians.select(slice(run.first, run.first + run.count)), error)
+    for waiting in chunks:
+        yield from _sog(waiting.name, waiting.take(), offset, antialiased)
     if levels.surroundings is not None:
         yield from _sog(ENVIRONMENT, levels.surroundings, offset, antialiased)
-    yield INDEX, json.dumps(_index(levels, chunks, names), separators=(",", ":")).encode()
+    index: dict[str, Any] = {
+        "version": VERSION,
+        "asset": {"generator": "Splatmill"},
+        "count": counts.total(),
+        "counts": [counts[number] for number in range(len(chunks))],
+        "lodLevels": len(chunks),
+        "lodErrors": True,
+    }
+    if levels.surroundings is not None:
+        index["environment"] = ENVIRONMENT
+    index["filenames"] = [name for each in chunks for name in each.names]
+    index["tree"] = _tree(levels.tree, torch.cat(boxes, 1), chunks)
+    yield INDEX, json.dumps(index, separators=(",", ":")).encode()
+
+
+@dataclass
+class _Chunks:
+    """The chunks of a level: runs of neighbouring leaves, which lie in one SOG.
+
+    level: its number, 0 for the finest. most: Gaussians of a chunk, unless a leaf has more.
+    names: of the SOGs that are full. places: of each leaf, the number of its SOG, the first Gaussian there and how many
+    there are. errors: of each leaf.
+    """
+
+    level: int
+    most: int
+    names: list[str] = field(default_factory=list)
+    places: list[tuple[int, int, int]] = field(default_factory=list)
+    errors: list[float] = field(default_factory=list)
+    _runs: list[Gaussians] = field(default_factory=list)
+    _count: int = 0
+
+    @property
+    def name(self) -> str:
+        """The path of the SOG that is filled."""
+        return f"{self.level}_{len(self.names)}/meta.json"
+
+    def has_room(self, count: int) -> bool:
+        """Whether a leaf of so many Gaussians goes into the chunk that is filled."""
+        return not self._runs or self._count + count <= self.most
+
+    def add(self, run: Gaussians, error: float) -> None:
+        """Add the Gaussians of the next leaf."""
+        self.places.append((len(self.names), self._count, run.count))
+        self.errors.append(error)
+        self._runs.append(run)
+        self._count += run.count
+
+    def take(self) -> Gaussians:
+        """The Gaussians of the chunk that is filled; the next begins."""
+        self.names.append(self.name)
+        runs, self._runs, self._count = self._runs, [], 0
+        return concatenate(*runs)
 
 
 def read(path: Path) -> Contents:
@@ -112,19 +174,23 @@ def read(path: Path) -> Contents:
         raise
     except (OSError, ValueError, KeyError, TypeError, IndexError, AttributeError, RecursionError) as error:
         raise ModelUnreadable(f"{path.name} could not be read as Streamed SOG: {plain(error)}.") from error
-    parts = []
     for name in names:
-        if not (part := path.parent / name).is_file():
+        if not (path.parent / name).is_file():
             raise ModelUnreadable(f"{path.name} names {name[:80]}, which is missing beside it.")
-        parts.append(sog.read(part))
-    return joined(parts)
+    return joined(sog.read(path.parent / name) for name in names)
 
 
-def joined(parts: Sequence[Contents]) -> Contents:
-    """The contents of at least one SOG as those of one model."""
-    degree = max(part.gaussians.degree for part in parts)
-    whole = concatenate(*(part.gaussians.padded(degree) for part in parts))
-    return Contents(whole, parts[0].offset, parts[0].antialiased, parts[0].notes)
+def joined(parts: Iterable[Contents]) -> Contents:
+    """The contents of at least one SOG as those of one model. Each is freed where nothing else holds it."""
+    waiting = deque(parts)
+    first = waiting[0]
+    count = sum(part.gaussians.count for part in waiting)
+    degree = max(part.gaussians.degree for part in waiting)
+    facts = first.offset, first.antialiased, first.notes
+    del first
+    return Contents(
+        gathered(count, degree, (waiting.popleft().gaussians for _ in range(len(waiting)))), *facts
+    )
 
 
 def files(path: Path) -> list[Path]:
@@ -134,61 +200,34 @@ def files(path: Path) -> list[Path]:
     return [path, *(file for name in names for file in sorted((path.parent / name).parent.iterdir()))]
 
 
-def _chunks(number: int, level: Level, most: int) -> Iterator[Chunk]:
-    """The runs of a level in chunks, each as large as it may be; a leaf is in one."""
-    first = count = 0
-    for leaf, run in enumerate(level.runs):
-        if leaf > first and count + run.count > most:
-            yield Chunk(number, first, leaf)
-            first, count = leaf, 0
-        count += run.count
-    yield Chunk(number, first, len(level.runs))
-
-
 def _sog(meta: str, gaussians: Gaussians, offset: Offset, antialiased: bool) -> Iterator[tuple[str, bytes]]:
     for name, content in sog.encoded(gaussians, offset=offset, antialiased=antialiased):
         yield str(PurePosixPath(meta).with_name(name)), content
 
 
-def _index(levels: Levels, chunks: list[Chunk], names: list[str]) -> dict[str, Any]:
-    counts = [level.gaussians.count for level in levels.levels]
-    index: dict[str, Any] = {
-        "version": VERSION,
-        "asset": {"generator": "Splatmill"},
-        "count": sum(counts),
-        "counts": counts,
-        "lodLevels": len(counts),
-        "lodErrors": True,
-    }
-    if levels.surroundings is not None:
-        index["environment"] = ENVIRONMENT
-    return index | {"filenames": names, "tree": _tree(levels, chunks)}
+def _tree(tree: Node, boxes: Tensor, chunks: Sequence[_Chunks]) -> dict[str, Any]:
+    """The tree with its boxes, and the places of the runs of each leaf.
 
+    boxes: of the leaves (`leaf_boxes`). chunks: of each level, whose files are one after the other.
+    """
+    firsts = [0, *accumulate(len(each.names) for each in chunks)]
 
-def _tree(levels: Levels, chunks: list[Chunk]) -> dict[str, Any]:
-    """The tree with its boxes, and the places of the runs of each leaf."""
-    leaves: list[dict[str, Any]] = [{"lods": {}, "errors": []} for _ in levels.levels[0].runs]
-    for file, chunk in enumerate(chunks):
-        runs = levels.levels[chunk.level].runs
-        for leaf in range(chunk.first, chunk.last):
-            place = {
-                "file": file,
-                "offset": runs[leaf].first - runs[chunk.first].first,
-                "count": runs[leaf].count,
-            }
-            leaves[leaf]["lods"][str(chunk.level)] = place
-            leaves[leaf]["errors"].append(_short(levels.levels[chunk.level].errors[leaf]))
-    boxes = leaf_boxes(levels)
+    def leaf(number: int) -> dict[str, Any]:
+        lods = {}
+        for first, each in zip(firsts, chunks, strict=False):
+            file, offset, count = each.places[number]
+            lods[str(each.level)] = {"file": first + file, "offset": offset, "count": count}
+        return {"lods": lods, "errors": [_short(each.errors[number]) for each in chunks]}
 
     def built(node: Node) -> dict[str, Any]:
         low = boxes[0, node.first : node.last].amin(0)
         high = boxes[1, node.first : node.last].amax(0)
         bound = {"min": [*map(_short, low.tolist())], "max": [*map(_short, high.tolist())]}
         if node.children is None:
-            return {"bound": bound} | leaves[node.first]
+            return {"bound": bound} | leaf(node.first)
         return {"bound": bound, "children": [built(child) for child in node.children]}
 
-    return built(levels.tree)
+    return built(tree)
 
 
 def _short(number: float) -> float:

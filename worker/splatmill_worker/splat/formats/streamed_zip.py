@@ -16,9 +16,8 @@ from splatmill.files import replacing
 from splatmill_worker.errors import ModelUnreadable, UnusablePicture
 from splatmill_worker.images.archives.archive import DAMAGED, BoundedReads
 from splatmill_worker.splat.formats import sog, sog_files, streamed_sog
-from splatmill_worker.splat.formats.contents import NO_OFFSET, Contents, Offset, visible
+from splatmill_worker.splat.formats.contents import NO_OFFSET, Contents, Offset
 from splatmill_worker.splat.gaussians import Gaussians
-from splatmill_worker.splat.lod.levels import make_levels
 from splatmill_worker.wording import plain
 
 MAX_LIST_BYTES = 2**23
@@ -30,13 +29,12 @@ def write(path: Path, gaussians: Gaussians, *, offset: Offset = NO_OFFSET, antia
 
     The file is replaced atomically and synced. The same model gives the same bytes.
     """
-    gaussians = visible(gaussians)
-    levels = make_levels(gaussians)
+    model, count = streamed_sog.divided_visible(gaussians)
     with replacing(path, sync=True) as part, zipfile.ZipFile(part, "w", zipfile.ZIP_STORED) as archive:
-        for name, content in streamed_sog.encoded(levels, offset=offset, antialiased=antialiased):
+        for name, content in streamed_sog.encoded(model, offset=offset, antialiased=antialiased):
             packing = zipfile.ZIP_DEFLATED if name == streamed_sog.INDEX else zipfile.ZIP_STORED
             archive.writestr(sog.member(name), content, packing)
-    return gaussians.count
+    return count
 
 
 def read(path: Path, *, list_bytes: int = MAX_LIST_BYTES) -> Contents:
@@ -55,12 +53,10 @@ def read(path: Path, *, list_bytes: int = MAX_LIST_BYTES) -> Contents:
             folder = _folder(archive)
             members = sog_files.Members(archive, folder)
             index = sog_files.contents(members, streamed_sog.INDEX, streamed_sog.MAX_INDEX_BYTES)
-            parts = []
-            for name in streamed_sog.finest(json.loads(index)):
-                parts.append(
-                    sog.contents(sog_files.Members(archive, f"{folder}{PurePosixPath(name).parent}/"))
-                )
-            return streamed_sog.joined(parts)
+            return streamed_sog.joined(
+                sog.contents(sog_files.Members(archive, f"{folder}{PurePosixPath(name).parent}/"))
+                for name in streamed_sog.finest(json.loads(index))
+            )
     except FileNotFoundError:
         raise
     except UnusablePicture as error:

@@ -88,7 +88,7 @@ def write_levels(
     most: int = MOST,
 ) -> None:
     """Write levels as `write` does. most: Gaussians of a tile at most, unless a leaf has more."""
-    tiles = _Tiles(levels, leaf_boxes(levels), path.parent, antialiased, most)
+    tiles = _Tiles(levels, leaf_boxes(levels.levels), path.parent, antialiased, most)
     path.unlink(missing_ok=True)
     (path.parent / FOLDER).mkdir(parents=True, exist_ok=True)
     root = tiles.write(levels.tree, len(levels.levels) - 1)

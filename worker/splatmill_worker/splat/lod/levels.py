@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -68,6 +69,45 @@ class Levels:
     levels: tuple[Level, ...]
     surroundings: Gaussians | None
 
+    def parts(self) -> Iterator[tuple[Level, ...]]:
+        """The levels of all leaves as one part, as of `Divided.parts`."""
+        yield self.levels
+
+
+@dataclass(frozen=True)
+class Divided:
+    """A model whose levels of detail are made part by part, so that memory need not hold all of them.
+
+    gaussians: float32 on the CPU. leaves: the rows of each leaf of `tree`, int64. count: of the levels.
+    tree, surroundings: of `Levels`.
+    """
+
+    gaussians: Gaussians
+    tree: Node
+    leaves: tuple[Tensor, ...]
+    count: int
+    surroundings: Gaussians | None
+
+    def parts(self) -> Iterator[tuple[Level, ...]]:
+        """The levels of some leaves at a time, in the order of the tree: runs and errors are those of these leaves."""
+        for batch in _batches(self.leaves):
+            part = self.gaussians.select(torch.cat(batch))
+            moments = moments_of(part)
+            groups = torch.repeat_interleave(
+                torch.arange(len(batch)), torch.tensor([len(rows) for rows in batch])
+            )
+            levels = list[Level]()
+            for level in range(self.count):
+                if level:
+                    moments, groups = _reduced(moments, groups, -(-moments.count // RATIO))
+                    part = gaussians_of(moments)
+                order = _in_runs(part.means, groups)
+                counts = torch.bincount(groups, minlength=len(batch))
+                firsts = (counts.cumsum(0) - counts).tolist()
+                runs = tuple(Run(*run) for run in zip(firsts, counts.tolist(), strict=True))
+                levels.append(Level(part.select(order), runs, tuple(_errors(moments, groups, len(batch)))))
+            yield tuple(levels)
+
 
 def make_levels(
     gaussians: Gaussians,
@@ -76,45 +116,53 @@ def make_levels(
     leaf: int = LEAF,
     most_surroundings: int = MOST_SURROUNDINGS,
 ) -> Levels:
-    """Return the levels of detail of a model: each has a quarter of the Gaussians of the one before.
+    """Return the levels of detail of a model at once; the arguments are those of `divided`."""
+    model = divided(gaussians, coarsest=coarsest, leaf=leaf, most_surroundings=most_surroundings)
+    return Levels(
+        model.tree, tuple(_joined(each) for each in zip(*model.parts(), strict=True)), model.surroundings
+    )
 
-    gaussians: float32 on the CPU, all finite. coarsest: Gaussians of the last level at most, so that there are
-    1 + ceil(log4(N / coarsest)) levels. leaf: Gaussians of a leaf at level 0, at most. most_surroundings: Gaussians of
-    the surroundings at most.
 
-    Leaves are merged by themselves, some at a time, so that beyond the model and its levels the memory has a bound.
+def divided(
+    gaussians: Gaussians,
+    rows: Tensor | None = None,
+    *,
+    coarsest: int = COARSEST,
+    leaf: int = LEAF,
+    most_surroundings: int = MOST_SURROUNDINGS,
+) -> Divided:
+    """Divide a model into leaves and surroundings. Each of its levels has a quarter of the Gaussians of the one before.
+
+    gaussians: float32 on the CPU. rows: bool [N], those that are used, all of them finite; None for all.
+    coarsest: Gaussians of the last level at most, so that there are 1 + ceil(log4(N / coarsest)) levels.
+    leaf: Gaussians of a leaf at level 0, at most. most_surroundings: Gaussians of the surroundings at most.
+
+    Beyond the model, the memory that this and `Divided.parts` take has a bound, but for some numbers for each row.
     """
-    far = surroundings(gaussians.means, most_surroundings)
-    surrounding = gaussians.select(far) if bool(far.any()) else None
-    scene = gaussians.select(~far) if surrounding is not None else gaussians
-    tree, leaves = partition(scene.means, leaf)
+    used = torch.arange(gaussians.count) if rows is None else rows.nonzero()[:, 0]
+    far = surroundings(gaussians.means[used], most_surroundings)
+    near = used[~far]
+    tree, leaves = partition(gaussians.means[near], leaf)
     levels = 0
-    while scene.count > coarsest * RATIO**levels:
+    while len(near) > coarsest * RATIO**levels:
         levels += 1
-    parts: list[list[Gaussians]] = [[] for _ in range(levels + 1)]
-    runs: list[list[Run]] = [[] for _ in range(levels + 1)]
-    errors: list[list[float]] = [[] for _ in range(levels + 1)]
-    for batch in _batches(leaves):
-        part = scene.select(torch.cat(batch))
-        moments = moments_of(part)
-        groups = torch.repeat_interleave(
-            torch.arange(len(batch)), torch.tensor([len(rows) for rows in batch])
-        )
-        for level in range(levels + 1):
-            if level:
-                moments, groups = _reduced(moments, groups, -(-moments.count // RATIO))
-                part = gaussians_of(moments)
-            order = _in_runs(part.means, groups)
-            parts[level].append(part.select(order))
-            errors[level] += _errors(moments, groups, len(batch))
-            for count in torch.bincount(groups, minlength=len(batch)).tolist():
-                before = runs[level][-1] if runs[level] else Run(0, 0)
-                runs[level].append(Run(before.first + before.count, count))
-    made = [
-        Level(concatenate(*part), tuple(run), tuple(error))
-        for part, run, error in zip(parts, runs, errors, strict=True)
-    ]
-    return Levels(tree, tuple(made), surrounding)
+    return Divided(
+        gaussians,
+        tree,
+        tuple(near[places] for places in leaves),
+        levels + 1,
+        gaussians.select(used[far]) if bool(far.any()) else None,
+    )
+
+
+def _joined(parts: tuple[Level, ...]) -> Level:
+    """A level of all leaves, from that of each part."""
+    runs, first = list[Run](), 0
+    for part in parts:
+        runs += [Run(first + run.first, run.count) for run in part.runs]
+        first += part.gaussians.count
+    errors = tuple(error for part in parts for error in part.errors)
+    return Level(concatenate(*(part.gaussians for part in parts)), tuple(runs), errors)
 
 
 def surroundings(means: Tensor, most: int) -> Tensor:
@@ -129,7 +177,7 @@ def surroundings(means: Tensor, most: int) -> Tensor:
     return far if int(far.sum()) <= most else torch.zeros_like(far)
 
 
-def _batches(leaves: list[Tensor]) -> list[list[Tensor]]:
+def _batches(leaves: Sequence[Tensor]) -> list[list[Tensor]]:
     """The leaves in their order, as many at a time as have _BATCH Gaussians, and at least one."""
     batches: list[list[Tensor]] = []
     count = 0

@@ -51,6 +51,10 @@ class Progress(Response):
     gaussians: int | None = Field(default=None, ge=0, description="Number of Gaussians.")
     seconds: Measured = Field(default=None, description="Seconds spent in this stage.")
     eta: Measured = Field(default=None, description="Estimated seconds until the stage ends.")
+    at_most: bool | None = Field(
+        default=None,
+        description="Whether `total` and `eta` are bounds: the stage ends where more gains too little.",
+    )
 
 
 class CurveRow(Response):
@@ -138,6 +142,22 @@ class SnapshotEvent(Response):
     bytes: int = Field(ge=0, description="Size of the snapshot in bytes.")
 
 
+class UnitEvent(Response):
+    """A unit of a scene in tiles began or ended: cameras, coarse model, a tile or its last steps, or the whole."""
+
+    type: Literal["unit"] = "unit"
+    unit: str = Field(
+        max_length=64, description="Name of the unit: cameras, coarse, tile-1, ..., seam-1, ..., scene."
+    )
+    state: Literal["running", "elsewhere", "done", "failed"] = Field(
+        description="elsewhere: another worker than that of the job has it."
+    )
+    tiles: int = Field(ge=1, description="Number of tiles of the scene.")
+    seconds: Measured = Field(default=None, description="Seconds that the unit took.")
+    photos: int | None = Field(default=None, ge=0, description="Number of photos that it was trained on.")
+    gaussians: int | None = Field(default=None, ge=0, description="Number of Gaussians that it left.")
+
+
 class PlanEvent(Response):
     """The plan of the training: what is done and what is left out, each with the fact that decided it."""
 
@@ -153,7 +173,8 @@ Event = Annotated[
     | PreviewEvent
     | PlanEvent
     | CamerasEvent
-    | SnapshotEvent,
+    | SnapshotEvent
+    | UnitEvent,
     Field(discriminator="type"),
 ]
 

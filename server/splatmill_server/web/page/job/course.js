@@ -36,6 +36,7 @@ const MOST_LINES = 1000;
  * @property {number} done
  * @property {number | null} total
  * @property {string} note
+ * @property {boolean} atMost whether `total` and `eta` are bounds
  * @property {number} began
  * @property {number} last time of the last report
  * @property {number | null} eta seconds until the stage ends
@@ -67,6 +68,8 @@ export class Course {
     this.cameras = null;
     /** @type {any} the last event of a snapshot */
     this.snapshot = null;
+    /** @type {Map<string, any>} the last event of each unit of a scene in tiles, in the order of their first ones */
+    this.units = new Map();
     /** Number of previews so far: it names the picture anew. */
     this.previews = 0;
   }
@@ -116,6 +119,9 @@ export class Course {
       case "snapshot":
         this.snapshot = { ...event, time };
         break;
+      case "unit":
+        this.units = new Map(this.units).set(event.unit, event);
+        break;
       case "preview":
         this.previews += 1;
         break;
@@ -148,7 +154,7 @@ export class Course {
     const share = event.total ? event.done / event.total : 0;
     const eta = event.eta ?? (share > 0.02 && passed > 1 ? (passed * (1 - share)) / share : null);
     this.stages.set(event.stage, {
-      name: event.stage, done: event.done, total: event.total ?? null, note: event.note ?? "", began, last: time, eta,
+      name: event.stage, done: event.done, total: event.total ?? null, note: event.note ?? "", atMost: event.at_most ?? false, began, last: time, eta,
     });
   }
 

@@ -17,6 +17,7 @@ import { showLog, warningsOf } from "./log.js";
 import { kindsOf, photoParts } from "./photos.js";
 import { planParts } from "./plan.js";
 import { showTimeline } from "./timeline.js";
+import { unitParts } from "./units.js";
 import { Watching } from "./watching.js";
 
 /** Milliseconds between two questions for the place in the queue. */
@@ -42,7 +43,7 @@ let report = null;
 let placement = null;
 let course = new Course();
 /** What is shown already, so that parts are made anew only where something changed. */
-let shown = { state: "", plan: null, rows: /** @type {any} */ (null), previews: 0, cameras: null, logged: 0, snapshot: null };
+let shown = { state: "", plan: null, units: /** @type {any} */ (null), rows: /** @type {any} */ (null), previews: 0, cameras: null, logged: 0, snapshot: null };
 let drawing = 0;
 /** What the server estimates of each part of the job. @type {Map<string, number | null>} */
 let estimate = new Map();
@@ -190,6 +191,11 @@ function draw() {
     shown.plan = course.plan;
     byId("plan-card").hidden = !course.plan;
     if (course.plan) byId("plan").replaceChildren(...planParts(course.plan));
+  }
+  if (shown.units !== course.units) {
+    shown.units = course.units;
+    byId("units-card").hidden = !course.units.size;
+    if (course.units.size) byId("units").replaceChildren(unitParts(course.units));
   }
   if (shown.logged !== course.logged) {
     shown.logged = course.logged;

@@ -47,13 +47,14 @@ function sentence(course, stage, name) {
   const { progress } = course;
   const parts = [];
   if (stage.name === "training") {
-    parts.push(`Step ${number(stage.done)}${stage.total ? ` of ${stage.note ? "at most" : "about"} ${number(stage.total)}` : ""}`);
+    parts.push(`Step ${number(stage.done)}${stage.total ? ` of ${stage.atMost ? "at most" : "about"} ${number(stage.total)}` : ""}`);
+    if (stage.note) parts.push(stage.note);
     if (progress.gaussians) parts.push(`${number(progress.gaussians)} Gaussians`);
   } else {
     parts.push(`${name}${stage.total ? `: ${number(stage.done)} of ${number(stage.total)}` : ""}`);
     if (stage.note && !/^(photos|pairs) /.test(stage.note)) parts.push(stage.note);
   }
-  if (stage.eta !== null) parts.push(`${stage.name === "training" && stage.note ? "at most" : "about"} ${seconds(stage.eta)} left of this stage`);
+  if (stage.eta !== null) parts.push(`${stage.atMost ? "at most" : "about"} ${seconds(stage.eta)} left of this stage`);
   return `${parts.join(", ")}.`;
 }
 
