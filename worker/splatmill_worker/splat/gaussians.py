@@ -15,6 +15,10 @@ REST_COEFFICIENTS = {0: 0, 1: 3, 2: 8, 3: 15}
 """Coefficients above the DC term per colour channel, by SH degree."""
 
 
+_ROWS = 2**18
+"""Rows that are tested at a time: the intermediate results for all rows would take as much memory as the parameters."""
+
+
 @dataclass(frozen=True)
 class Gaussians:
     """N Gaussians as unconstrained parameters (Kerbl et al. 2023, section 4).
@@ -89,7 +93,9 @@ class Gaussians:
         """bool [N]: rows whose every parameter is finite and whose quaternion has a direction."""
         keep: Tensor = torch.linalg.vector_norm(self.quats, dim=1) > 0
         for value in self:
-            keep &= torch.isfinite(value.unsqueeze(-1).flatten(1)).all(dim=1)  # also of no rows
+            rows = value.unsqueeze(-1).flatten(1)
+            for first in range(0, self.count, _ROWS):
+                keep[first : first + _ROWS] &= torch.isfinite(rows[first : first + _ROWS]).all(dim=1)
         return keep
 
     def padded(self, degree: int) -> Gaussians:

@@ -11,7 +11,7 @@ import json
 import math
 import zipfile
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -274,19 +274,8 @@ def member(name: str) -> zipfile.ZipInfo:
 
 def contents(files: sog_files.Files) -> Contents:
     """The model in the files of a SOG. Raises what `read` turns into ModelUnreadable."""
-    meta = json.loads(sog_files.contents(files, "meta.json", MAX_META_BYTES))
-    version = meta.get("version") if isinstance(meta, dict) else None
-    if version != VERSION:
-        raise ValueError(
-            f"its meta.json says version {version!r:.20}, and only version {VERSION} is read; "
-            "splat-transform converts earlier ones"
-        )
-    count = meta["count"]
-    if type(count) is not int or count < 0:
-        raise ValueError(f"its count is {count!r:.20}")
-    names = _names(meta)
-    degree = _degree(meta["shN"]) if "shN" in meta else 0
-    check_gaussians(count, degree, sum(files.size(name) for part in names.values() for name in part))
+    head = announced(files)
+    meta, count, degree, names = head.meta, head.count, head.degree, head.names
     pixels = max(PIXELS_PER_GAUSSIAN * count + MORE_PIXELS, MAX_CENTROIDS * REST_COEFFICIENTS[degree])
     most = 4 * pixels + MAX_META_BYTES  # an image that could not be compressed, with its metadata
     side: tuple[int, int] | None = None
@@ -317,6 +306,39 @@ def contents(files: sog_files.Files) -> Contents:
         x, y, z = _numbers(meta["splatmill"]["offset"], 3).tolist()
         offset = (x, y, z)
     return Contents.of(gaussians, offset, _antialiased(meta))
+
+
+@dataclass(frozen=True)
+class Announced:
+    """What the `meta.json` of a SOG announces.
+
+    meta: the document. count, degree: of the Gaussians. names: of the images of each part. bytes: of all images.
+    """
+
+    meta: dict[str, Any]
+    count: int
+    degree: int
+    names: dict[str, list[str]]
+    bytes: int
+
+
+def announced(files: sog_files.Files) -> Announced:
+    """What a SOG announces, which its files and the memory can hold. Raises as `contents`."""
+    meta = json.loads(sog_files.contents(files, "meta.json", MAX_META_BYTES))
+    version = meta.get("version") if isinstance(meta, dict) else None
+    if version != VERSION:
+        raise ValueError(
+            f"its meta.json says version {version!r:.20}, and only version {VERSION} is read; "
+            "splat-transform converts earlier ones"
+        )
+    count = meta["count"]
+    if type(count) is not int or count < 0:
+        raise ValueError(f"its count is {count!r:.20}")
+    names = _names(meta)
+    degree = _degree(meta["shN"]) if "shN" in meta else 0
+    size = sum(files.size(name) for part in names.values() for name in part)
+    check_gaussians(count, degree, size)
+    return Announced(meta, count, degree, names, size)
 
 
 def _antialiased(meta: dict[str, Any]) -> bool | None:

@@ -51,7 +51,7 @@ class Members:
         return self._archive.NameToInfo[path]
 
 
-class _Beside:
+class Beside:
     """The files beside a `meta.json`, which is `path`. Raises ValueError for one in another folder."""
 
     def __init__(self, path: Path) -> None:
@@ -79,7 +79,7 @@ def opened(path: Path) -> Iterator[Files]:
     if not zipfile.is_zipfile(path):
         if path.is_file() and path.suffix.lower() != ".json":
             raise ValueError("it is no zip archive, or it is cut off")
-        yield _Beside(path)
+        yield Beside(path)
         return
     bounded = BoundedReads(io.FileIO(path), MAX_LIST_BYTES, _list_too_long)
     with bounded as file, zipfile.ZipFile(cast(IO[bytes], file)) as archive:

@@ -7,9 +7,9 @@ surroundings of a scene are its `environment`, which stands outside of the tree,
 from __future__ import annotations
 
 import json
-from collections import Counter, deque
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import accumulate
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -18,8 +18,9 @@ import torch
 from torch import Tensor
 
 from splatmill.files import atomic_write
-from splatmill_worker.errors import ModelUnreadable
-from splatmill_worker.splat.formats import sog
+from splatmill_worker.errors import ModelUnreadable, UnusablePicture
+from splatmill_worker.readers.reader_memory import check_gaussians
+from splatmill_worker.splat.formats import sog, sog_files
 from splatmill_worker.splat.formats.contents import (
     NO_OFFSET,
     Contents,
@@ -42,6 +43,9 @@ CHUNK = 65536
 INDEX = "lod-meta.json"
 
 ENVIRONMENT = "env/meta.json"
+
+COPIES = 2
+"""Times the memory of the parameters that `joined` takes: they, and a part."""
 
 MAX_INDEX_BYTES = 2**23
 """Bytes of a `lod-meta.json`, of which a leaf takes some 400; Python takes up to thirty times as many to parse it."""
@@ -170,27 +174,42 @@ def read(path: Path) -> Contents:
         if path.stat().st_size > MAX_INDEX_BYTES:
             raise ValueError(f"it has more than {MAX_INDEX_BYTES} bytes")
         names = finest(json.loads(path.read_bytes()))
+        for name in names:
+            if not (path.parent / name).is_file():
+                raise ValueError(f"it names {name[:80]}, which is missing beside it")
+        return joined([sog_files.Beside(path.parent / name) for name in names])
     except FileNotFoundError:
         raise
-    except (OSError, ValueError, KeyError, TypeError, IndexError, AttributeError, RecursionError) as error:
+    except UnusablePicture as error:
+        raise ModelUnreadable(f"{path.name} cannot be read: {error.message}") from error
+    except (
+        OSError,
+        ValueError,
+        OverflowError,
+        LookupError,
+        TypeError,
+        AttributeError,
+        RecursionError,
+    ) as error:
         raise ModelUnreadable(f"{path.name} could not be read as Streamed SOG: {plain(error)}.") from error
-    for name in names:
-        if not (path.parent / name).is_file():
-            raise ModelUnreadable(f"{path.name} names {name[:80]}, which is missing beside it.")
-    return joined(sog.read(path.parent / name) for name in names)
 
 
-def joined(parts: Iterable[Contents]) -> Contents:
-    """The contents of at least one SOG as those of one model. Each is freed where nothing else holds it."""
-    waiting = deque(parts)
-    first = waiting[0]
-    count = sum(part.gaussians.count for part in waiting)
-    degree = max(part.gaussians.degree for part in waiting)
-    facts = first.offset, first.antialiased, first.notes
-    del first
-    return Contents(
-        gathered(count, degree, (waiting.popleft().gaussians for _ in range(len(waiting)))), *facts
-    )
+def joined(parts: Sequence[sog_files.Files]) -> Contents:
+    """The contents of at least one SOG as those of one model, of which one part at a time is held twice."""
+    heads = [sog.announced(part) for part in parts]
+    count, degree = sum(head.count for head in heads), max(head.degree for head in heads)
+    check_gaussians(count, degree, sum(head.bytes for head in heads), COPIES)
+    first = list[Contents]()
+
+    def pieces() -> Iterator[Gaussians]:
+        for part in parts:
+            contents = sog.contents(part)
+            if not first:
+                first.append(replace(contents, gaussians=contents.gaussians.select(slice(0))))
+            yield contents.gaussians
+
+    gaussians = gathered(count, degree, pieces())
+    return replace(first[0], gaussians=gaussians)
 
 
 def files(path: Path) -> list[Path]:

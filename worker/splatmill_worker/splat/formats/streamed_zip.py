@@ -54,8 +54,10 @@ def read(path: Path, *, list_bytes: int = MAX_LIST_BYTES) -> Contents:
             members = sog_files.Members(archive, folder)
             index = sog_files.contents(members, streamed_sog.INDEX, streamed_sog.MAX_INDEX_BYTES)
             return streamed_sog.joined(
-                sog.contents(sog_files.Members(archive, f"{folder}{PurePosixPath(name).parent}/"))
-                for name in streamed_sog.finest(json.loads(index))
+                [
+                    sog_files.Members(archive, f"{folder}{PurePosixPath(name).parent}/")
+                    for name in streamed_sog.finest(json.loads(index))
+                ]
             )
     except FileNotFoundError:
         raise

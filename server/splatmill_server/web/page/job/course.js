@@ -16,6 +16,7 @@ const STAGES = new Map(Object.entries({
   loading: "Loading the photos",
   training: "Training",
   evaluation: "Comparing photos with the scene",
+  writing: "Writing files",
 }));
 
 /** The name of a stage for people. @param {string} stage */
