@@ -23,6 +23,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from statistics import mean
 from typing import Any
 
 import _page
@@ -31,6 +32,7 @@ from _data import FOLDERS, SHARED
 from _rows import Row, distinct, footer, of
 from _studies.study import Study
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 
 from splatmill.schema import TrainOptions
 from splatmill_worker.synthetic import capture as still_life
@@ -141,25 +143,50 @@ def timed(*arguments: str) -> tuple[int, dict[str, float], str]:
     return child.returncode, figures, text
 
 
-def pairs(rows: list[Row]) -> Iterator[tuple[Row, Row]]:
-    """The row of one piece and a row of tiles, of each scene."""
+KINDS = {"coarse": "coarse model", "tile": "tiles", "seam": "their last steps", "scene": "whole scene"}
+"""Labels of the kinds of units, by what their names begin with."""
+
+Pair = tuple[Row, Row]
+"""The row of one piece, and that of tiles with the same seed."""
+
+
+def compared_scenes(rows: list[Row]) -> list[list[Pair]]:
+    """The pairs of each scene and number of tiles, by seed."""
+    found: dict[tuple[Any, ...], list[Pair]] = {}
     for row in rows:
         if row["tiles"] > 1:
             for one in of(rows, scene=row["scene"], steps=row["steps"], seed=row["seed"], tiles=1):
-                yield one, row
+                found.setdefault((row["scene"], row["tiles"], row["steps"]), []).append((one, row))
+    return [sorted(pairs, key=lambda pair: pair[0]["seed"]) for pairs in found.values()]
+
+
+def difference(pair: Pair) -> float:
+    """PSNR in tiles less that in one piece, dB."""
+    one, row = pair
+    return float(row["psnr"] - one["psnr"])
+
+
+def means(pairs: list[Pair], field: str) -> tuple[float, float]:
+    """The means of a field over the seeds: in one piece, and in tiles."""
+    ones, rows = zip(*pairs, strict=True)
+    return mean(one[field] for one in ones), mean(row[field] for row in rows)
 
 
 def table(rows: list[Row]) -> str:
-    head = "scene|tiles:|PSNR in one piece:|in tiles:|difference:|SSIM in one piece:|in tiles:|Gaussians in one piece:"
-    lines = [
-        [
-            one["scene"], row["tiles"], f"{one['psnr']:.2f} dB", f"{row['psnr']:.2f} dB",
-            f"{row['psnr'] - one['psnr']:+.2f} dB", f"{one['ssim']:.4f}", f"{row['ssim']:.4f}",
-            f"{one['gaussians']:,}", f"{row['gaussians']:,}", f"{row['seam_cost']:+.2f} dB",
-        ]
-        for one, row in pairs(rows)
-    ]  # fmt: skip
-    return _page.table(f"{head}|in tiles:|seams cost:", lines)
+    lines = []
+    for pairs in compared_scenes(rows):
+        (whole, tiles), (ssim, tiled), (many, few) = (means(pairs, x) for x in ("psnr", "ssim", "gaussians"))
+        each = ", ".join(f"{difference(pair):+.2f}" for pair in pairs)
+        cost = mean(row["seam_cost"] for _, row in pairs)
+        lines.append(
+            [
+                pairs[0][1]["scene"], pairs[0][1]["tiles"], f"{whole:.2f} dB", f"{tiles:.2f} dB",
+                f"{tiles - whole:+.2f} dB", each, f"{ssim:.4f}", f"{tiled:.4f}", f"{many:,.0f}", f"{few:,.0f}",
+                f"{cost:+.2f} dB",
+            ]
+        )  # fmt: skip
+    head = "scene|tiles:|PSNR in one piece:|in tiles:|difference:|of each seed:|SSIM in one piece:|in tiles:"
+    return _page.table(f"{head}|Gaussians in one piece:|in tiles:|seams cost:", lines)
 
 
 def costs(rows: list[Row]) -> str:
@@ -168,49 +195,57 @@ def costs(rows: list[Row]) -> str:
     )
     lines = [
         [
-            one["scene"], row["tiles"], f"{one['cpu']:.0f}", f"{row['cpu']:.0f}", f"{row['chain']:.0f}",
+            row["scene"], row["tiles"], f"{one['cpu']:.0f}", f"{row['cpu']:.0f}", f"{row['chain']:.0f}",
             f"{one['memory'] / 1e6:.0f} MB", f"{row['memory'] / 1e6:.0f} MB",
         ]
-        for one, row in pairs(rows)
+        for (one, row), *_ in compared_scenes(rows)
     ]  # fmt: skip
     return _page.table(head, lines)
 
 
 def conclusion(rows: list[Row]) -> str:
-    """The least and the largest difference to one piece."""
-    differences = [(row["psnr"] - one["psnr"], row["scene"], row["tiles"]) for one, row in pairs(rows)]
-    if not differences:
+    """The least and the largest mean difference to one piece."""
+    scenes = [(mean(map(difference, pairs)), pairs[0][1]["scene"]) for pairs in compared_scenes(rows)]
+    if not scenes:
         return ""
-    (least, worst, _), (most, best, _) = min(differences), max(differences)
-    return f"PSNR in tiles is {least:+.2f} dB ({worst}) to {most:+.2f} dB ({best}) of that in one piece."
+    (least, worst), (most, best) = min(scenes), max(scenes)
+    return (
+        f"PSNR in tiles is {least:+.2f} dB ({worst}) to {most:+.2f} dB ({best}) of that in one piece, "
+        f"in the mean over seeds; over all captures, {mean(each for each, _ in scenes):+.2f} dB."
+    )
 
 
 def draw(rows: list[Row]) -> Figure:
     """CPU seconds of each unit, stacked, beside those of one piece."""
-    both = list(pairs(rows))
+    both = [pairs[0] for pairs in compared_scenes(rows)]
     figure, panels = _plot.axes(1, 1, width=6.0, height=0.5 + 0.55 * max(1, len(both)))
     panel = panels[0]
     for place, (one, row) in enumerate(both):
         panel.barh(place + 0.2, one["cpu"], height=0.35, color=_plot.CYCLE[0])
         left = 0.0
-        for number, (name, use) in enumerate((n, u) for n, u in row["units"].items() if n != "cameras"):
-            panel.barh(
-                place - 0.2, use["cpu"], left=left, height=0.35, color=_plot.CYCLE[1 + number % 2], label=None
-            )
-            panel.text(left + use["cpu"] / 2, place - 0.2, name, ha="center", va="center", fontsize=5)
+        for name, use in row["units"].items():
+            if name == "cameras":
+                continue
+            kind = name.partition("-")[0]
+            color = _plot.CYCLE[1 + list(KINDS).index(kind)]
+            panel.barh(place - 0.2, use["cpu"], left=left, height=0.35, color=color, edgecolor="white")
             left += use["cpu"]
+    handles = [Patch(color=_plot.CYCLE[0], label="in one piece")]
+    handles += [
+        Patch(color=_plot.CYCLE[1 + number], label=label) for number, label in enumerate(KINDS.values())
+    ]
+    panel.legend(handles=handles, fontsize=7, loc="lower right")
     panel.set_yticks(
         range(len(both)), [f"{row['scene']}, {row['tiles']} tiles" for _, row in both], fontsize=7
     )
-    _plot.name(panel, "CPU seconds (upper bar: in one piece; lower bar: units)", size=8)
+    _plot.name(panel, "CPU seconds of the first seed", size=8)
     return figure
 
 
 def made(rows: list[Row]) -> str:
-    steps = ", ".join(str(x) for x in distinct(rows, "steps"))
-    return (
-        f"Made by `splatmill bench tiles` with {steps} steps, one seed, without the cameras.\n{footer(rows)}"
-    )
+    steps, seeds = (", ".join(str(x) for x in distinct(rows, name)) for name in ("steps", "seed"))
+    by = f"Made by `splatmill bench tiles` with {steps} steps and the seeds {seeds}, without the cameras."
+    return f"{by}\n{footer(rows)}"
 
 
 STUDY = Study(
