@@ -19,6 +19,7 @@ from splatmill_server.access.exposure import check_exposure, unbounded_trust
 from splatmill_server.access.permission import PERMITTED, is_open
 from splatmill_server.access.sessions import COOKIE
 from splatmill_server.base import cancelling, problems, root_path
+from splatmill_server.base.packed import PackedCameras
 from splatmill_server.base.proxies import TrustedProxies
 from splatmill_server.base.settings import Settings
 from splatmill_server.middleware import RequestMiddleware
@@ -101,6 +102,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             Middleware(TrustedProxies, trusted_hosts=settings.forwarded_allow_ips),
             *pages_of_others(settings.cors),
             Middleware(RequestMiddleware, service=service),
+            Middleware(PackedCameras),
         ],
     )
     app.state.service = service

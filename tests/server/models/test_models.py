@@ -9,6 +9,8 @@ import json
 import pytest
 
 from splatmill.backplane.storage import layout
+from splatmill.schema import CameraSpec, ModelCamera, ModelCameras
+from splatmill.schema.headers import write_json
 from tests.support.served_app import ServedApp, problem, store_model
 
 
@@ -37,6 +39,22 @@ def test_a_model_says_what_it_is(app: ServedApp, model_id: str) -> None:
     assert app.http.get(f"/v1/models/{model_id}/cameras").json() == {"cameras": [], "up": None}
     assert app.http.get(f"/v1/jobs/{model_id}/report").json()["curve"][0]["psnr"] == 27.5
     assert app.http.get(f"/v1/jobs/{model_id}/preview").content == b"\xff\xd8\xff preview"
+
+
+def test_many_cameras_are_sent_compressed_to_those_who_read_it(app: ServedApp, model_id: str) -> None:
+    camera = CameraSpec.looking_at((0.1, 0.2, -3.0), (0.0, 0.0, 0.0), width=64, height=48)
+    cameras = [ModelCamera(name=f"{number}.jpg", split="train", camera=camera) for number in range(100)]
+    path = layout.model_file(model_id, "cameras.json")
+    app.service.storage.put(path, write_json(ModelCameras(cameras=cameras)).encode())
+    address = f"/v1/models/{model_id}/cameras"
+    plain = app.http.get(address, headers={"Accept-Encoding": "identity"})
+    packed = app.http.get(address, headers={"Accept-Encoding": "gzip"})
+    assert "content-encoding" not in plain.headers
+    assert packed.headers["content-encoding"] == "gzip"
+    assert packed.json() == plain.json()
+    assert len(packed.json()["cameras"]) == 100
+    assert int(packed.headers["content-length"]) < int(plain.headers["content-length"]) / 4
+    assert "content-encoding" not in app.http.get(f"/v1/models/{model_id}/files/cameras.json").headers
 
 
 def test_a_file_can_be_read_in_parts_and_is_not_sent_twice(app: ServedApp, model_id: str) -> None:
