@@ -8,7 +8,7 @@ OUT ?= demo
 ARGS ?= --novel-view --orbit $(if $(PHOTOS),,--time-budget 1m)
 # Extra arguments of pip, e.g. PIP_ARGS="--extra-index-url ..." to choose another build of torch.
 PIP_ARGS ?=
-# Bytecode is made of the modules that are used, when they are: of all that is installed, it takes half a minute.
+# Modules are compiled when they are first imported: compiling all that is installed takes half a minute.
 PIP = $(BIN)/python -m pip install -q --no-compile $(PIP_ARGS)
 VENV := .venv
 BIN := $(VENV)/bin

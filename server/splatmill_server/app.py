@@ -19,10 +19,10 @@ from splatmill_server.access.exposure import check_exposure, unbounded_trust
 from splatmill_server.access.permission import PERMITTED, is_open
 from splatmill_server.access.sessions import COOKIE
 from splatmill_server.base import cancelling, problems, root_path
-from splatmill_server.base.packed import PackedCameras
 from splatmill_server.base.proxies import TrustedProxies
 from splatmill_server.base.settings import Settings
 from splatmill_server.middleware import RequestMiddleware
+from splatmill_server.responses.packed import PackedCameras
 from splatmill_server.routes import bin as bin_routes
 from splatmill_server.routes import (
     captures,

@@ -512,6 +512,10 @@ def test_the_units_of_a_scene_in_tiles_are_counted_by_kind(page: Page) -> None:
         ["Last steps of tiles", "0 of 9", "", "", ""],
         ["Whole scene", "", "", "", ""],
     ]
+    # With its attempt, what was in work has ended.
+    state = lambda name: {"type": "state", "state": name}  # noqa: E731
+    lost = page.evaluate(rows, [state("training"), *events, state("queued")])
+    assert lost[2] == ["Tiles", "2 of 9", "9 failed", "3,000", "3.0 s"]
     many = [{"unit": f"seam-{number}", "state": "elsewhere"} for number in range(1, 8)]
     assert page.evaluate(rows, [*many, {"unit": "scene", "state": "running"}])[3:] == [
         ["Last steps of tiles", "0 of 9", "7 tiles on other workers", "", ""],

@@ -60,7 +60,9 @@ def measured(options: argparse.Namespace) -> Iterator[Row | str]:
             if scene == "still":
                 still_life(capture)
             elif scene in FOLDERS and (SHARED / FOLDERS[scene]).is_dir():
-                shutil.copytree(SHARED / FOLDERS[scene] / "images", capture / "images")
+                # Cameras of photos with alpha alone: those of the others are recovered.
+                part = "" if (SHARED / FOLDERS[scene] / "train").is_dir() else "images"
+                shutil.copytree(SHARED / FOLDERS[scene] / part, capture / part)
             else:
                 yield f"{scene} is left out: there is no such capture."
                 continue

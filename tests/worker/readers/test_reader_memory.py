@@ -16,7 +16,7 @@ from plyfile import PlyData, PlyElement
 from splatmill_worker.readers import reader_memory
 from splatmill_worker.splat.formats import palette, ply, registry, streamed_sog
 from splatmill_worker.splat.gaussians import Gaussians
-from splatmill_worker.splat.lod.levels import divided
+from splatmill_worker.splat.lod.levels import divide
 from tests.support.decoding.reader_peak import peaks
 from tests.support.files.ksplat_files import ksplat
 from tests.support.gaussians import some_gaussians
@@ -98,22 +98,25 @@ def test_a_reader_takes_no_more_than_its_copies(
         rgba = np.full((part.count, 4), 99, np.uint8)
         values = (part.means.numpy(), part.log_scales.exp().numpy(), part.quats.numpy(), rgba, rest)
         paths[-1].write_bytes(ksplat(*values, level=1))
-    parameters = 4 * COUNT * (11 + 3 * (degree + 1) ** 2)
+    parameters = COUNT * reader_memory.parameter_bytes(degree)
     for path, (size, said) in zip(paths[1:], read(paths), strict=True):
         assert said == "read", (path.name, said)
         copies = ply.COPIES if path.name == "m.ply" else reader_memory.COPIES
         assert size < copies * parameters, (path.name, size / parameters)
 
 
-def test_levels_of_detail_are_read_a_part_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Parts of 5 % of the model, as the parts of a model of a million are."""
+@pytest.mark.parametrize("chunk", [16_384, COUNT // 2])
+def test_levels_of_detail_are_read_a_part_at_a_time(
+    tmp_path: Path, chunk: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Parts of a tenth of the model, and of a half."""
     monkeypatch.setattr(palette, "palette", any_palette)
     registry.write(tmp_path / "small.ply", some_gaussians(3, 1))
     index = tmp_path / "lod-meta.json"
-    streamed_sog.write_levels(index, divided(gaussians(3)), chunk=8192)
+    streamed_sog.write_levels(index, divide(gaussians(3)), chunk=chunk)
     ((size, said),) = read([tmp_path / "small.ply", index])
     assert said == "read"
-    assert size < streamed_sog.COPIES * 4 * COUNT * (11 + 3 * 16)
+    assert size < reader_memory.parameter_bytes(3) * (COUNT + reader_memory.COPIES * chunk)
 
 
 def test_a_reader_of_degree_4_takes_no_more_than_its_copies(tmp_path: Path) -> None:

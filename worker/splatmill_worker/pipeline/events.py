@@ -71,9 +71,9 @@ class TrainingEvents:
         """Emit how many photos the finished scene was compared with."""
         self._emit_progress("evaluation", done, total, "photos compared with the scene")
 
-    def writing(self, done: int, total: int, what: str) -> None:
+    def writing(self, what: str) -> None:
         """Emit which of the files of the model are written now."""
-        self._emit_progress("writing", done, total, what)
+        self._emit(ProgressEvent(stage="writing", note=what))
 
     def evaluated(self, point: CurvePoint, engine: Engine) -> None:
         """Emit the metrics of an evaluation, and render the preview anew."""

@@ -30,9 +30,9 @@ def write_files(
     """Write the model, its cameras, the last preview, the film and the report."""
     plan, world = planned.plan, cameras.exported
     with stages.measured("export"):
-        record.events.writing(0, 3, "the model and the photos that were held out")
+        record.events.writing("the model and the photos that were held out")
         exported = export(job.out, trained, plan, world, planned.held_out)
-        record.events.writing(1, 3, "the cameras and a preview")
+        record.events.writing("the cameras and a preview")
         write_cameras(
             job.out / "cameras.zip",
             cameras.scene,
@@ -54,7 +54,7 @@ def write_files(
         stages.add("time_lapse", record.lapse.seconds)
     if job.looks is not None and job.looks.seconds:
         stages.add("live", job.looks.seconds)
-    record.events.writing(2, 3, "the report")
+    record.events.writing("the report")
     write_report(
         job.out,
         planned,

@@ -52,5 +52,9 @@ def check_gaussians(count: int, degree: int, size: int, copies: int = COPIES) ->
 
     copies: times the memory of the parameters that the reader takes.
     """
-    parameters = 4 * (11 + 3 * (degree + 1) ** 2)
-    check(f"reading its {count:,} Gaussians", copies * parameters * count, size)
+    check(f"reading its {count:,} Gaussians", copies * parameter_bytes(degree) * count, size)
+
+
+def parameter_bytes(degree: int) -> int:
+    """Bytes of the parameters of a Gaussian with harmonics of `degree`."""
+    return 4 * (11 + 3 * (degree + 1) ** 2)

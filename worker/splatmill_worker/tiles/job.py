@@ -102,13 +102,13 @@ class _Work:
     looks: Looks | None
     others: Others
     entered: list[JobState] = field(default_factory=list)
-    told: dict[str, str] = field(default_factory=dict)
+    reported: dict[str, str] = field(default_factory=dict)
 
-    def tell(self, name: str, state: Literal["running", "elsewhere", "done", "failed"]) -> None:
-        """Emit the state of a unit, with its facts where it is done, unless it was told."""
-        if self.told.get(name) == state:
+    def report(self, name: str, state: Literal["running", "elsewhere", "done", "failed"]) -> None:
+        """Emit the state of a unit, with its facts where it is done, unless that was the last one."""
+        if self.reported.get(name) == state:
             return
-        self.told[name] = state
+        self.reported[name] = state
         facts: dict[str, Any] = {}
         path = self.folder.ended()[name].path if state == "done" else None
         if path is not None:
@@ -165,7 +165,7 @@ def _step(work: _Work) -> None:
     folder, others = work.folder, work.others
     states = folder.states()
     for name, state in states.items():
-        work.tell(name, state)
+        work.report(name, state)
     ready = folder.plan.ready(states)
     tiles = [name for name in ready if name in folder.plan.part_names]
     # What failed here is not known elsewhere: the last steps beside a tile that failed are left to this process.
@@ -177,7 +177,7 @@ def _step(work: _Work) -> None:
         if name not in tiles or others.take_back(name):
             free = name
             break
-        work.tell(name, "elsewhere")
+        work.report(name, "elsewhere")
     others.gather(folder)  # what has ended since
     if free is None:
         _wait(work, tiles)
@@ -192,7 +192,7 @@ def _do(work: _Work, name: str) -> None:
     if state not in work.entered:
         work.entered.append(state)
         work.emit(StateEvent(state=state))
-    work.tell(name, "running")
+    work.report(name, "running")
     with folder.claimed(name) as run:
         context = Context(
             folder,
@@ -212,10 +212,10 @@ def _do(work: _Work, name: str) -> None:
                 raise
             run.fail(error.message, error.advice or "")
             work.emit(LogEvent(level="warning", message=f"{name} failed: {error}"))
-            work.tell(name, "failed")
+            work.report(name, "failed")
             return
     return_freed()
-    work.tell(name, "done")
+    work.report(name, "done")
     if name != "scene":
         work.others.stored(run.path)
     if name == "cameras" and (run.path / SFM).is_dir():

@@ -91,9 +91,9 @@ def gathered(count: int, degree: int, pieces: Iterable[Gaussians]) -> Gaussians:
     for piece in pieces:
         first, end = end, end + piece.count
         for target, values in zip(whole, piece.padded(degree), strict=True):
-            target[first:end].numpy()[...] = (
-                values.numpy()
-            )  # by one thread: those of torch wait for each other
+            # By NumPy: of small pieces, torch's threads would take longer to wait for each other than to copy.
+            target[first:end].numpy()[...] = values.numpy()
+        del piece, values  # before the next is made
     return whole.select(slice(end))
 
 

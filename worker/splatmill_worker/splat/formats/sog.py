@@ -274,7 +274,7 @@ def member(name: str) -> zipfile.ZipInfo:
 
 def contents(files: sog_files.Files) -> Contents:
     """The model in the files of a SOG. Raises what `read` turns into ModelUnreadable."""
-    head = announced(files)
+    head = header(files)
     meta, count, degree, names = head.meta, head.count, head.degree, head.names
     pixels = max(PIXELS_PER_GAUSSIAN * count + MORE_PIXELS, MAX_CENTROIDS * REST_COEFFICIENTS[degree])
     most = 4 * pixels + MAX_META_BYTES  # an image that could not be compressed, with its metadata
@@ -309,7 +309,7 @@ def contents(files: sog_files.Files) -> Contents:
 
 
 @dataclass(frozen=True)
-class Announced:
+class Header:
     """What the `meta.json` of a SOG announces.
 
     meta: the document. count, degree: of the Gaussians. names: of the images of each part. bytes: of all images.
@@ -322,7 +322,7 @@ class Announced:
     bytes: int
 
 
-def announced(files: sog_files.Files) -> Announced:
+def header(files: sog_files.Files) -> Header:
     """What a SOG announces, which its files and the memory can hold. Raises as `contents`."""
     meta = json.loads(sog_files.contents(files, "meta.json", MAX_META_BYTES))
     version = meta.get("version") if isinstance(meta, dict) else None
@@ -338,7 +338,7 @@ def announced(files: sog_files.Files) -> Announced:
     degree = _degree(meta["shN"]) if "shN" in meta else 0
     size = sum(files.size(name) for part in names.values() for name in part)
     check_gaussians(count, degree, size)
-    return Announced(meta, count, degree, names, size)
+    return Header(meta, count, degree, names, size)
 
 
 def _antialiased(meta: dict[str, Any]) -> bool | None:

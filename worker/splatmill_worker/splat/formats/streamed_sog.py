@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import accumulate
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -19,7 +19,7 @@ from torch import Tensor
 
 from splatmill.files import atomic_write
 from splatmill_worker.errors import ModelUnreadable, UnusablePicture
-from splatmill_worker.readers.reader_memory import check_gaussians
+from splatmill_worker.readers.reader_memory import COPIES, check, parameter_bytes
 from splatmill_worker.splat.formats import sog, sog_files
 from splatmill_worker.splat.formats.contents import (
     NO_OFFSET,
@@ -31,7 +31,7 @@ from splatmill_worker.splat.formats.contents import (
 )
 from splatmill_worker.splat.gaussians import Gaussians, concatenate
 from splatmill_worker.splat.lod.boxes import leaf_boxes
-from splatmill_worker.splat.lod.levels import Divided, Levels, divided
+from splatmill_worker.splat.lod.levels import Division, Levels, divide
 from splatmill_worker.splat.lod.partition import Node
 from splatmill_worker.wording import plain
 
@@ -43,9 +43,6 @@ CHUNK = 65536
 INDEX = "lod-meta.json"
 
 ENVIRONMENT = "env/meta.json"
-
-COPIES = 2
-"""Times the memory of the parameters that `joined` takes: they, and a part."""
 
 MAX_INDEX_BYTES = 2**23
 """Bytes of a `lod-meta.json`, of which a leaf takes some 400; Python takes up to thirty times as many to parse it."""
@@ -64,16 +61,16 @@ def write(path: Path, gaussians: Gaussians, *, offset: Offset = NO_OFFSET, antia
     return count
 
 
-def divided_visible(gaussians: Gaussians) -> tuple[Divided, int]:
+def divided_visible(gaussians: Gaussians) -> tuple[Division, int]:
     """The rows of a model that a file holds, for `encoded`, and how many they are."""
     gaussians = on_cpu(gaussians)
     rows = visible_rows(gaussians)
-    return divided(gaussians, rows), int(rows.sum())
+    return divide(gaussians, rows), int(rows.sum())
 
 
 def write_levels(
     path: Path,
-    levels: Levels | Divided,
+    levels: Levels | Division,
     *,
     offset: Offset = NO_OFFSET,
     antialiased: bool = False,
@@ -86,7 +83,7 @@ def write_levels(
 
 
 def encoded(
-    levels: Levels | Divided,
+    levels: Levels | Division,
     *,
     offset: Offset = NO_OFFSET,
     antialiased: bool = False,
@@ -94,7 +91,7 @@ def encoded(
 ) -> Iterator[tuple[str, bytes]]:
     """The files of a model by their paths: those of each chunk together, and the index last. Else as `write_levels`.
 
-    A chunk is written as soon as it is full, so that memory holds at most one of each level beside a part of `levels`.
+    A chunk is written as soon as it is full, so that memory holds one of each level and two parts of `levels`.
     """
     chunks, boxes, counts = list[_Chunks](), list[Tensor](), Counter[int]()
     for part in levels.parts():
@@ -195,21 +192,32 @@ def read(path: Path) -> Contents:
 
 
 def joined(parts: Sequence[sog_files.Files]) -> Contents:
-    """The contents of at least one SOG as those of one model, of which one part at a time is held twice."""
-    heads = [sog.announced(part) for part in parts]
-    count, degree = sum(head.count for head in heads), max(head.degree for head in heads)
-    check_gaussians(count, degree, sum(head.bytes for head in heads), COPIES)
-    first = list[Contents]()
+    """The contents of at least one SOG as those of one model, with the offset and the notes of the first.
+
+    It takes the memory of the model, and for one part at a time what reading a SOG takes.
+    """
+    count = degree = largest = size = 0
+    for part in parts:  # their documents are not kept: each may take 30 MB
+        head = sog.header(part)
+        count, size = count + head.count, size + head.bytes
+        degree, largest = max(degree, head.degree), max(largest, head.count)
+    needed = parameter_bytes(degree) * (count + COPIES * largest)
+    check(f"reading its {count:,} Gaussians", needed, size)
+    facts: dict[str, Any] = {}
 
     def pieces() -> Iterator[Gaussians]:
         for part in parts:
-            contents = sog.contents(part)
-            if not first:
-                first.append(replace(contents, gaussians=contents.gaussians.select(slice(0))))
-            yield contents.gaussians
+            yield _piece(part, facts)
 
-    gaussians = gathered(count, degree, pieces())
-    return replace(first[0], gaussians=gaussians)
+    return Contents(gathered(count, degree, pieces()), **facts)
+
+
+def _piece(part: sog_files.Files, facts: dict[str, Any]) -> Gaussians:
+    """The Gaussians of a SOG. facts: gets the other fields of its contents if it is empty."""
+    contents = sog.contents(part)
+    if not facts:
+        facts |= {"offset": contents.offset, "antialiased": contents.antialiased, "notes": contents.notes}
+    return contents.gaussians
 
 
 def files(path: Path) -> list[Path]:

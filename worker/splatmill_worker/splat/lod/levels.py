@@ -70,12 +70,12 @@ class Levels:
     surroundings: Gaussians | None
 
     def parts(self) -> Iterator[tuple[Level, ...]]:
-        """The levels of all leaves as one part, as of `Divided.parts`."""
+        """The levels of all leaves as one part, as of `Division.parts`."""
         yield self.levels
 
 
 @dataclass(frozen=True)
-class Divided:
+class Division:
     """A model whose levels of detail are made part by part, so that memory need not hold all of them.
 
     gaussians: float32 on the CPU. leaves: the rows of each leaf of `tree`, int64. count: of the levels.
@@ -116,28 +116,28 @@ def make_levels(
     leaf: int = LEAF,
     most_surroundings: int = MOST_SURROUNDINGS,
 ) -> Levels:
-    """Return the levels of detail of a model at once; the arguments are those of `divided`."""
-    model = divided(gaussians, coarsest=coarsest, leaf=leaf, most_surroundings=most_surroundings)
+    """Return the levels of detail of a model at once; the arguments are those of `divide`."""
+    model = divide(gaussians, coarsest=coarsest, leaf=leaf, most_surroundings=most_surroundings)
     return Levels(
         model.tree, tuple(_joined(each) for each in zip(*model.parts(), strict=True)), model.surroundings
     )
 
 
-def divided(
+def divide(
     gaussians: Gaussians,
     rows: Tensor | None = None,
     *,
     coarsest: int = COARSEST,
     leaf: int = LEAF,
     most_surroundings: int = MOST_SURROUNDINGS,
-) -> Divided:
+) -> Division:
     """Divide a model into leaves and surroundings. Each of its levels has a quarter of the Gaussians of the one before.
 
     gaussians: float32 on the CPU. rows: bool [N], those that are used, all of them finite; None for all.
     coarsest: Gaussians of the last level at most, so that there are 1 + ceil(log4(N / coarsest)) levels.
     leaf: Gaussians of a leaf at level 0, at most. most_surroundings: Gaussians of the surroundings at most.
 
-    Beyond the model, the memory that this and `Divided.parts` take has a bound, but for some numbers for each row.
+    Beyond the model, the memory that this and `Division.parts` take has a bound, but for some numbers for each row.
     """
     used = torch.arange(gaussians.count) if rows is None else rows.nonzero()[:, 0]
     far = surroundings(gaussians.means[used], most_surroundings)
@@ -146,7 +146,7 @@ def divided(
     levels = 0
     while len(near) > coarsest * RATIO**levels:
         levels += 1
-    return Divided(
+    return Division(
         gaussians,
         tree,
         tuple(near[places] for places in leaves),

@@ -150,7 +150,8 @@ class UnitEvent(Response):
         max_length=64, description="Name of the unit: cameras, coarse, tile-1, ..., seam-1, ..., scene."
     )
     state: Literal["running", "elsewhere", "done", "failed"] = Field(
-        description="elsewhere: another worker than that of the job has it."
+        description="elsewhere: another worker had it when that of the job looked, between two of its units. What is "
+        "running or elsewhere when an attempt ends was not finished."
     )
     tiles: int = Field(ge=1, description="Number of tiles of the scene.")
     seconds: Measured = Field(default=None, description="Seconds that the unit took.")

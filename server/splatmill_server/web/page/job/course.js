@@ -143,6 +143,10 @@ export class Course {
     this.attempt = attempt;
     this.problem = event.problem ?? null;
     this.progress = null;
+    if (this.final || again) {
+      // What was in work has ended with the attempt.
+      this.units = new Map([...this.units].filter(([, unit]) => unit.state === "done" || unit.state === "failed"));
+    }
     if (!this.final) this.spans.push({ state: event.state, from: time, to: null });
   }
 

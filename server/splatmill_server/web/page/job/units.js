@@ -16,7 +16,7 @@ export function unitParts(units) {
     h("thead", {}, h("tr", {},
       h("th", { scope: "col" }, "Part"),
       h("th", { scope: "col", class: "number" }, "Done"),
-      h("th", { scope: "col" }, "In work"),
+      h("th", { scope: "col" }, "In work or failed"),
       h("th", { scope: "col", class: "number" }, "Gaussians"),
       h("th", { scope: "col", class: "number" }, "Time of one"))),
     h("tbody", {}, KINDS.map(([kind, title]) => {
