@@ -258,7 +258,10 @@ STUDY = Study(
     blocks={"conclusion": conclusion, "table": table, "costs": costs, "footer": made},
     figures={"tiles": draw},
     options={
-        "scenes": {"nargs": "*", "default": ["still", "fox", "kermit", "lund", "snowmiku"]},
+        "scenes": {
+            "nargs": "*",
+            "default": ["still", "fox", "kermit", "lund", "snowmiku", "beer", "lego", "room"],
+        },
         "tiles": {"nargs": "+", "type": int, "default": [4]},
         "steps": {"type": int, "default": 3000},
         "image-size": {"type": int, "default": 480},

@@ -44,6 +44,9 @@ INDEX = "lod-meta.json"
 
 ENVIRONMENT = "env/meta.json"
 
+DAMAGE = (OSError, ValueError, OverflowError, LookupError, TypeError, AttributeError, RecursionError)
+"""What reading a document of unexpected contents raises."""
+
 MAX_INDEX_BYTES = 2**23
 """Bytes of a `lod-meta.json`, of which a leaf takes some 400; Python takes up to thirty times as many to parse it."""
 
@@ -179,15 +182,7 @@ def read(path: Path) -> Contents:
         raise
     except UnusablePicture as error:
         raise ModelUnreadable(f"{path.name} cannot be read: {error.message}") from error
-    except (
-        OSError,
-        ValueError,
-        OverflowError,
-        LookupError,
-        TypeError,
-        AttributeError,
-        RecursionError,
-    ) as error:
+    except DAMAGE as error:
         raise ModelUnreadable(f"{path.name} could not be read as Streamed SOG: {plain(error)}.") from error
 
 

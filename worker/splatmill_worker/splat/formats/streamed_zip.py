@@ -63,16 +63,7 @@ def read(path: Path, *, list_bytes: int = MAX_LIST_BYTES) -> Contents:
         raise
     except UnusablePicture as error:
         raise ModelUnreadable(f"{path.name} cannot be read: {error.message}") from error
-    except (
-        *DAMAGED,
-        OSError,
-        ValueError,
-        OverflowError,
-        LookupError,
-        TypeError,
-        AttributeError,
-        RecursionError,
-    ) as error:
+    except (*DAMAGED, *streamed_sog.DAMAGE) as error:
         raise ModelUnreadable(
             f"{path.name} could not be read as levels of detail: {plain(error)}."
         ) from error
