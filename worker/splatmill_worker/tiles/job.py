@@ -104,15 +104,15 @@ class _Work:
     entered: list[JobState] = field(default_factory=list)
     reported: dict[str, str] = field(default_factory=dict)
 
-    def report(self, name: str, state: Literal["running", "elsewhere", "done", "failed"]) -> None:
-        """Emit the state of a unit, with its facts where it is done, unless that was the last one."""
+    def report(
+        self, name: str, state: Literal["running", "elsewhere", "done", "failed"], output: Path | None = None
+    ) -> None:
+        """Emit the state of a unit, unless that was the last one. output: folder of one that is done, for its facts."""
         if self.reported.get(name) == state:
             return
         self.reported[name] = state
-        facts: dict[str, Any] = {}
-        path = self.folder.ended()[name].path if state == "done" else None
-        if path is not None:
-            facts = {key: value for key, value in facts_of(path).items() if key in UNIT_FACTS}
+        facts: dict[str, Any] = {} if output is None else facts_of(output)
+        facts = {key: value for key, value in facts.items() if key in UNIT_FACTS}
         self.emit(UnitEvent(unit=name, state=state, tiles=self.folder.plan.tiles, **facts))
 
 
@@ -163,9 +163,10 @@ def _step(work: _Work) -> None:
     if work.cancelled():
         raise Cancelled
     folder, others = work.folder, work.others
-    states = folder.states()
-    for name, state in states.items():
-        work.report(name, state)
+    ended = folder.ended()
+    states = {name: end.state for name, end in ended.items()}
+    for name, end in ended.items():
+        work.report(name, end.state, end.path)
     ready = folder.plan.ready(states)
     tiles = [name for name in ready if name in folder.plan.part_names]
     # What failed here is not known elsewhere: the last steps beside a tile that failed are left to this process.
@@ -215,7 +216,7 @@ def _do(work: _Work, name: str) -> None:
             work.report(name, "failed")
             return
     return_freed()
-    work.report(name, "done")
+    work.report(name, "done", run.path)
     if name != "scene":
         work.others.stored(run.path)
     if name == "cameras" and (run.path / SFM).is_dir():
