@@ -30,6 +30,10 @@ pytestmark = [
 MOST_GROWTH = 100 * 10**6
 """Bytes that a refused file may take, by the kernel's count."""
 
+KEPT_FREE = 16 * 10**6
+"""Bytes that the allocator may keep between one part of a model and the next: a busy machine took 66 million where 58
+million are usual. A second copy of the model would take 35 million."""
+
 
 def read(paths: list[Path]) -> list[tuple[int, str]]:
     return peaks("splatmill_worker.splat.formats.registry:read", paths)
@@ -116,7 +120,8 @@ def test_levels_of_detail_are_read_a_part_at_a_time(
     streamed_sog.write_levels(index, divide(gaussians(3)), chunk=chunk)
     ((size, said),) = read([tmp_path / "small.ply", index])
     assert said == "read"
-    assert size < reader_memory.parameter_bytes(3) * (COUNT + reader_memory.COPIES * chunk)
+    promised = reader_memory.parameter_bytes(3) * (COUNT + reader_memory.COPIES * chunk)
+    assert size < promised + KEPT_FREE
 
 
 def test_a_reader_of_degree_4_takes_no_more_than_its_copies(tmp_path: Path) -> None:
