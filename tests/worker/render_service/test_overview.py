@@ -12,7 +12,7 @@ import torch
 from splatmill.schema import OrbitRequest
 from splatmill.schema.files.formats import MODEL_FORMATS
 from splatmill_worker.render_service.encoding import camera_of, render_frame
-from splatmill_worker.render_service.local import load, overview
+from splatmill_worker.render_service.local import loaded, overview
 from splatmill_worker.splat import orbit
 from splatmill_worker.splat.formats import registry
 from splatmill_worker.splat.gaussians import SH_C0, Gaussians
@@ -85,9 +85,9 @@ def test_the_top_is_at_the_top_in_every_format(tmp_path: Path, suffix: str) -> N
     )
     path = tmp_path / (f"m{suffix}" if suffix.startswith(".") else suffix)
     registry.write(path, scene)
-    model = load(path)
-    camera = camera_of(overview(model, 64, orbit.UP))
-    picture = render_frame(model, camera, "black").astype(int)
+    with loaded(path) as model:
+        camera = camera_of(overview(model, 64, orbit.UP))
+        picture = render_frame(model, camera, "black").astype(int)
     upper, lower = picture[12:20].mean((0, 1)), picture[30:38].mean((0, 1))
     assert upper[0] > upper[2] + 50
     assert lower[2] > lower[0] + 50

@@ -66,7 +66,7 @@ def _render(model: LoadedModel, camera: Camera, background: str) -> dict[str, np
 
     with torch.no_grad():
         rendered = render(
-            model.gaussians,
+            model.seen_by(camera),
             camera,
             background=_WHITE if background == "white" else _BLACK,
             antialias=model.antialias,
@@ -81,7 +81,7 @@ def _surface(model: LoadedModel, camera: Camera) -> tuple[npt.NDArray[np.float32
     """Return median depth [H, W] and normals [H, W, 3] as float32 arrays."""
     from splatmill_worker.splat.surface import surface
 
-    seen = surface(model.gaussians, camera, antialias=model.antialias, backend=cast(Any, model.backend))
+    seen = surface(model.seen_by(camera), camera, antialias=model.antialias, backend=cast(Any, model.backend))
     return seen.depth.cpu().numpy(), seen.normal.cpu().numpy()
 
 

@@ -6,6 +6,8 @@ import argparse
 import json
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,8 +21,9 @@ from splatmill_worker.errors import ModelUnreadable
 from splatmill_worker.film import Film
 from splatmill_worker.render_service.encoding import render_frame, render_image
 from splatmill_worker.render_service.model_cache import LoadedModel, antialias_of
-from splatmill_worker.splat.formats import registry
+from splatmill_worker.splat.formats import registry, streamed_views
 from splatmill_worker.splat.formats.contents import Contents
+from splatmill_worker.splat.lod.choice import TOLERANCE
 from splatmill_worker.splat.orbit import DEFAULT_FOV, Float, orbit_cameras, path_of
 
 UNWRITABLE, REFUSED, STOPPED = 1, 5, 130
@@ -69,10 +72,10 @@ def render_file(model: Path, out: Path, request: dict[str, Any], width: int | No
 
     Raises ModelUnreadable, FileNotFoundError, and OSError where `out` cannot be written.
     """
-    loaded = load(model)
-    if "camera" not in request:
-        request |= {"camera": overview(loaded, width or DEFAULT_WIDTH, AXES[up])}
-    atomic_write(out, render_image(loaded, RenderRequest.model_validate(request)).data)
+    with loaded(model) as drawn:
+        if "camera" not in request:
+            request |= {"camera": overview(drawn, width or DEFAULT_WIDTH, AXES[up])}
+        atomic_write(out, render_image(drawn, RenderRequest.model_validate(request)).data)
 
 
 def orbit_file(model: Path, out: Path, request: OrbitRequest, cameras: Path | None, up: str) -> None:
@@ -82,22 +85,36 @@ def orbit_file(model: Path, out: Path, request: OrbitRequest, cameras: Path | No
 
     Raises ModelUnreadable, FileNotFoundError, and OSError or av.FFmpegError where `out` cannot be written.
     """
-    loaded = load(model)
     stored = ModelCameras.model_validate_json(cameras.read_bytes()) if cameras is not None else None
-    path = orbit_cameras(stored, loaded.gaussians, request, AXES[up])
     said = time.monotonic()
-    with replacing(out) as part, Film(part, request.width, request.height, request.fps) as film:
-        for index, camera in enumerate(path):
-            film.add(render_frame(loaded, camera, request.background))
+    with (
+        loaded(model) as drawn,
+        replacing(out) as part,
+        Film(part, request.width, request.height, request.fps) as film,
+    ):
+        for index, camera in enumerate(orbit_cameras(stored, drawn.gaussians, request, AXES[up])):
+            film.add(render_frame(drawn, camera, request.background))
             if time.monotonic() - said > _SAY_EVERY:
                 said = time.monotonic()
                 print(f"{index + 1} of {request.frames} frames", flush=True)
 
 
-def load(model: Path) -> LoadedModel:
-    """Return the model in a file of any readable format. Raises ModelUnreadable, and FileNotFoundError."""
-    contents = read(model)
-    return LoadedModel(str(model), "", contents.gaussians, bool(contents.antialiased), 0)
+@contextmanager
+def loaded(model: Path) -> Iterator[LoadedModel]:
+    """The model in a file of any readable format. One in levels of detail stays open: a view reads what it draws of it.
+
+    Raises ModelUnreadable, and FileNotFoundError.
+    """
+    with streamed_views.opened(model) as leveled:
+        contents = _checked(model, registry.read(model) if leveled is None else leveled.overview)
+        reads = None if leveled is None else leveled.seen_by
+        yield LoadedModel(str(model), "", contents.gaussians, bool(contents.antialiased), 0, reads=reads)
+        if leveled is not None and leveled.tolerance > TOLERANCE:
+            print(
+                f"{model.name}: memory held the Gaussians of a view only where they may be "
+                f"{leveled.tolerance:g} pixels from their places; {TOLERANCE:g} are usual.",
+                file=sys.stderr,
+            )
 
 
 def read(model: Path) -> Contents:
@@ -106,7 +123,10 @@ def read(model: Path) -> Contents:
     Where the file does not say so, a report.json beside it does. Its notes are printed. Raises ModelUnreadable, and
     FileNotFoundError.
     """
-    contents = registry.read(model)
+    return _checked(model, registry.read(model))
+
+
+def _checked(model: Path, contents: Contents) -> Contents:
     if not contents.gaussians.count:
         raise ModelUnreadable(f"{model.name} has no Gaussians with finite values.")
     for note in contents.notes:

@@ -6,6 +6,7 @@ import json
 import tempfile
 import threading
 from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +16,7 @@ from splatmill.backplane.storage.storage import Entry, Storage
 from splatmill_worker.errors import ModelNotFound
 
 if TYPE_CHECKING:
+    from splatmill_worker.scene import Camera
     from splatmill_worker.splat.gaussians import Gaussians
 
 
@@ -29,6 +31,8 @@ class LoadedModel:
     bytes: memory of its parameters.
     backend: the kernels that render it; None means those of the parameters' device.
     offset: world = model + offset, as in splat.formats.contents.
+    reads: returns the Gaussians that a camera sees, of a model that is in memory in part; `gaussians` are then those of
+        an overview. None: the model is whole.
     """
 
     id: str
@@ -38,6 +42,11 @@ class LoadedModel:
     bytes: int
     backend: str | None = None
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    reads: Callable[[Camera], Gaussians] | None = None
+
+    def seen_by(self, camera: Camera) -> Gaussians:
+        """The Gaussians that the view of `camera` is drawn from. Raises ModelUnreadable for a damaged file."""
+        return self.gaussians if self.reads is None else self.reads(camera)
 
 
 class ModelCache:

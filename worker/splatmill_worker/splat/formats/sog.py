@@ -274,24 +274,34 @@ def member(name: str) -> zipfile.ZipInfo:
 
 def contents(files: sog_files.Files) -> Contents:
     """The model in the files of a SOG. Raises what `read` turns into ModelUnreadable."""
+    gaussians, meta = rows(files)
+    offset = NO_OFFSET
+    if isinstance(meta.get("splatmill"), dict):
+        x, y, z = _numbers(meta["splatmill"]["offset"], 3).tolist()
+        offset = (x, y, z)
+    return Contents.of(gaussians, offset, _antialiased(meta))
+
+
+def rows(files: sog_files.Files) -> tuple[Gaussians, dict[str, Any]]:
+    """All rows of a SOG, also those that are not finite, and its `meta.json`. Raises as `contents`."""
     head = header(files)
     meta, count, degree, names = head.meta, head.count, head.degree, head.names
-    pixels = max(PIXELS_PER_GAUSSIAN * count + MORE_PIXELS, MAX_CENTROIDS * REST_COEFFICIENTS[degree])
-    most = 4 * pixels + MAX_META_BYTES  # an image that could not be compressed, with its metadata
+    largest = max(PIXELS_PER_GAUSSIAN * count + MORE_PIXELS, MAX_CENTROIDS * REST_COEFFICIENTS[degree])
+    most = 4 * largest + MAX_META_BYTES  # an image that could not be compressed, with its metadata
     side: tuple[int, int] | None = None
 
-    def rows(part: str, index: int, channels: int) -> Plane:
+    def plane(part: str, index: int, channels: int) -> Plane:
         nonlocal side
         name = names[part][index]
-        plane = _decoded(files, name, most, channels, partial(_check_side, name, count, side))
-        side = plane.shape[1], plane.shape[0]
-        return plane.reshape(-1, channels)[:count]
+        pixels = _decoded(files, name, most, channels, partial(_check_side, name, count, side))
+        side = pixels.shape[1], pixels.shape[0]
+        return pixels.reshape(-1, channels)[:count]
 
-    colors = rows("sh0", 0, 4)
+    colors = plane("sh0", 0, 4)
     gaussians = Gaussians(
-        means=_means(meta["means"], rows("means", 0, 3), rows("means", 1, 3)),
-        log_scales=_looked_up(meta["scales"], rows("scales", 0, 3)),
-        quats=_unpacked(rows("quats", 0, 4)),
+        means=_means(meta["means"], plane("means", 0, 3), plane("means", 1, 3)),
+        log_scales=_looked_up(meta["scales"], plane("scales", 0, 3)),
+        quats=_unpacked(plane("quats", 0, 4)),
         sh=_looked_up(meta["sh0"], colors[:, :3])[:, None],
         logit_opacities=logits(torch.from_numpy(colors[:, 3].astype(np.float32)) / 255),
     )
@@ -299,13 +309,9 @@ def contents(files: sog_files.Files) -> Contents:
         centroids = _decoded(
             files, names["shN"][0], most, 3, partial(_check_palette, names["shN"][0], degree)
         )
-        rest = _read_harmonics(meta["shN"], centroids, rows("shN", 1, 3))
+        rest = _read_harmonics(meta["shN"], centroids, plane("shN", 1, 3))
         gaussians = replace(gaussians, sh=torch.cat([gaussians.sh, rest], 1))
-    offset = NO_OFFSET
-    if isinstance(meta.get("splatmill"), dict):
-        x, y, z = _numbers(meta["splatmill"]["offset"], 3).tolist()
-        offset = (x, y, z)
-    return Contents.of(gaussians, offset, _antialiased(meta))
+    return gaussians, meta
 
 
 @dataclass(frozen=True)

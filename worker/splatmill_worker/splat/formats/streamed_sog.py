@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import accumulate
 from pathlib import Path, PurePosixPath
@@ -19,6 +20,7 @@ from torch import Tensor
 
 from splatmill.files import atomic_write
 from splatmill_worker.errors import ModelUnreadable, UnusablePicture
+from splatmill_worker.images.archives.archive import DAMAGED
 from splatmill_worker.readers.reader_memory import COPIES, check, parameter_bytes
 from splatmill_worker.splat.formats import sog, sog_files
 from splatmill_worker.splat.formats.contents import (
@@ -44,8 +46,17 @@ INDEX = "lod-meta.json"
 
 ENVIRONMENT = "env/meta.json"
 
-DAMAGE = (OSError, ValueError, OverflowError, LookupError, TypeError, AttributeError, RecursionError)
-"""What reading a document of unexpected contents raises."""
+DAMAGE = (
+    *DAMAGED,
+    OSError,
+    ValueError,
+    OverflowError,
+    LookupError,
+    TypeError,
+    AttributeError,
+    RecursionError,
+)
+"""What reading a document of unexpected contents raises, or an archive."""
 
 MAX_INDEX_BYTES = 2**23
 """Bytes of a `lod-meta.json`, of which a leaf takes some 400; Python takes up to thirty times as many to parse it."""
@@ -170,20 +181,49 @@ def read(path: Path) -> Contents:
 
     Raises ModelUnreadable for any other file, and FileNotFoundError where there is none.
     """
+    with unreadable(path, "Streamed SOG"), opened(path) as document:
+        return joined([document.part(name) for name in finest(document.index)])
+
+
+@dataclass(frozen=True)
+class Document:
+    """An opened model in levels of detail.
+
+    index: the document in its `lod-meta.json`. part: the files of the SOG whose `meta.json` the index names.
+    """
+
+    index: Any
+    part: Callable[[str], sog_files.Files]
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[Document]:
+    """The model of a `lod-meta.json`. Raises what `unreadable` turns into ModelUnreadable."""
+    if path.stat().st_size > MAX_INDEX_BYTES:
+        raise ValueError(f"it has more than {MAX_INDEX_BYTES} bytes")
+
+    def part(name: str) -> sog_files.Files:
+        if not (path.parent / name).is_file():
+            raise ValueError(f"it names {name[:80]}, which is missing beside it")
+        return sog_files.Beside(path.parent / name)
+
+    yield Document(json.loads(path.read_bytes()), part)
+
+
+@contextmanager
+def unreadable(path: Path, what: str) -> Iterator[None]:
+    """Turn what reading damaged or foreign files raises into ModelUnreadable, but for FileNotFoundError.
+
+    what: what the file was read as.
+    """
     try:
-        if path.stat().st_size > MAX_INDEX_BYTES:
-            raise ValueError(f"it has more than {MAX_INDEX_BYTES} bytes")
-        names = finest(json.loads(path.read_bytes()))
-        for name in names:
-            if not (path.parent / name).is_file():
-                raise ValueError(f"it names {name[:80]}, which is missing beside it")
-        return joined([sog_files.Beside(path.parent / name) for name in names])
+        yield
     except FileNotFoundError:
         raise
     except UnusablePicture as error:
         raise ModelUnreadable(f"{path.name} cannot be read: {error.message}") from error
     except DAMAGE as error:
-        raise ModelUnreadable(f"{path.name} could not be read as Streamed SOG: {plain(error)}.") from error
+        raise ModelUnreadable(f"{path.name} could not be read as {what}: {plain(error)}.") from error
 
 
 def joined(parts: Sequence[sog_files.Files]) -> Contents:
@@ -276,8 +316,13 @@ def finest(index: Any) -> list[str]:
     names += [index["environment"]] if index.get("environment") else []
     if not names:
         raise ValueError("its tree has no leaf with level 0")
+    check_names(names)
+    return names
+
+
+def check_names(names: Sequence[str]) -> None:
+    """Raise ValueError for the path of a SOG that leads out of the folder of its index."""
     for name in names:
         place = PurePosixPath(name)
         if place.is_absolute() or ".." in place.parts or place.name != "meta.json":
             raise ValueError(f"it names {name[:80]!r}, which is no meta.json in a folder beside it")
-    return names
