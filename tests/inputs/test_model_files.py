@@ -17,8 +17,8 @@ import torch
 
 from splatmill.schema import CameraSpec, OrbitRequest
 from splatmill_worker.render_service.encoding import camera_of, render_frame
-from splatmill_worker.render_service.local import load
-from splatmill_worker.splat.formats import ply
+from splatmill_worker.render_service.local import loaded
+from splatmill_worker.splat.formats import ply, registry
 from splatmill_worker.splat.gaussians import SH_C0, Gaussians
 from splatmill_worker.splat.orbit import UP, orbit_cameras
 from splatmill_worker.splat.render import render
@@ -83,14 +83,15 @@ def test_a_model_of_mip_splatting_is_drawn_antialiased(files: Path) -> None:
         render(scene, camera, background=(0, 0, 0), antialias=antialias).color.clamp(0, 1)
         for antialias in (True, False)
     )
-    picture = torch.from_numpy(render_frame(load(files / "mip.ply"), camera, "black")) / 255
+    with loaded(files / "mip.ply") as model:
+        picture = torch.from_numpy(render_frame(model, camera, "black")) / 255
     assert float((picture - right).abs().max()) < 0.01
     assert float((wrong - right).abs().max()) > 0.1
 
 
 @pytest.mark.skipif(not GUITAR.is_file(), reason="the shared data sets are not on this machine")
 def test_the_orbit_of_a_guitar_shows_it_upright() -> None:
-    scene = load(GUITAR).gaussians
+    scene = registry.read(GUITAR).gaussians
     # The first camera of a circle and the opposite one see the front and the back.
     for camera in list(orbit_cameras(None, scene, OrbitRequest(seconds=1), UP))[::12]:
         seen = scene.means.double().numpy() @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]

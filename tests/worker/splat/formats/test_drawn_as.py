@@ -23,7 +23,7 @@ from splatmill_worker.render_service.clean import Wanted, clean_file
 from splatmill_worker.render_service.convert import convert
 from splatmill_worker.render_service.edit import edit
 from splatmill_worker.render_service.encoding import camera_of, render_frame
-from splatmill_worker.render_service.local import load
+from splatmill_worker.render_service.local import loaded, read
 from splatmill_worker.render_service.model_cache import ModelCache
 from splatmill_worker.splat.formats import compressed_ply, ply, registry
 from splatmill_worker.splat.render import render
@@ -111,12 +111,13 @@ def test_a_file_alone_is_drawn_converted_and_cleaned_as_it_says(tmp_path: Path) 
         for antialias in (True, False)
     )
     assert float((right - wrong).abs().max()) > 0.1
-    picture = torch.from_numpy(render_frame(load(model), camera_of(camera), "black")) / 255
+    with loaded(model) as drawn:
+        picture = torch.from_numpy(render_frame(drawn, camera_of(camera), "black")) / 255
     assert float((picture - right.clamp(0, 1)).abs().max()) < 0.01
     outs = [tmp_path / (f"out{suffix}" if suffix.startswith(".") else suffix) for suffix in WRITTEN]
     convert(model, outs, None)
     clean_file(model, tmp_path / "cleaned.ply", Wanted(edit=BOX))
-    assert all(load(out).antialias for out in [*outs, tmp_path / "cleaned.ply"])
+    assert all(read(out).antialiased for out in [*outs, tmp_path / "cleaned.ply"])
 
 
 def test_a_stored_model_without_a_report_is_drawn_and_edited_as_its_file_says(tmp_path: Path) -> None:

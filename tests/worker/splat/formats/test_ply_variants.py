@@ -167,7 +167,7 @@ def test_commands_and_training_say_what_is_read_otherwise(
 ) -> None:
     del columns["scale_2"]
     path = stored(tmp_path / "m.ply", columns, comment="SplatRenderMode: fog")
-    local.load(path)
+    local.read(path)
     said = capsys.readouterr().err.splitlines()
     assert [line.split(" ")[0] for line in said] == ["m.ply:", "m.ply:"]
     assert "2D Gaussians" in said[0]
