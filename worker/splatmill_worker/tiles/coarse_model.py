@@ -50,6 +50,11 @@ class Coarse:
     facts: dict[str, Any]
     disagreements: tuple[Disagreement, ...]
 
+    @property
+    def stopped_by_limit(self) -> bool:
+        """Whether the training has as many Gaussians as it was allowed, which is less than the whole scene may have."""
+        return self.gaussians.count >= self.plan.max_gaussians
+
     @cached_property
     def far(self) -> Tensor:
         """Which of the Gaussians no tile trains, bool [N] (see `far`)."""

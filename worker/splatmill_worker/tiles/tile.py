@@ -157,6 +157,9 @@ def tile_plan(coarse: Coarse, free: int, photos: int, *, last: bool = False) -> 
     where both trainings together use a photo more than MANY_VISITS times, a tile takes only the last part of the fall
     of the rates, MANY_VISITS over that number: what so many steps learn at high rates is rather the photos than the
     scene (decisions: tile-rates).
+
+    Gaussians are added where the limit of the coarse training stopped it. Else it has made as many as the photos ask
+    for, and those that a tile would add learn what single photos show (decisions: tile-growth).
     """
     plan, schedule = coarse.plan, coarse.plan.schedule
     until, boost = 1.0 - LAST, schedule.annealing.boost
@@ -174,12 +177,14 @@ def tile_plan(coarse: Coarse, free: int, photos: int, *, last: bool = False) -> 
         begin=skipped + (1.0 - skipped) * begin,
         end=skipped + (1.0 - skipped) * end,
     )
-    most = free if last else max(free, math.ceil(coarse.most * free / max(1, coarse.gaussians.count)))
+    most, asked_for_none = free, not plan.densify and "densify" in plan.forced
+    if coarse.stopped_by_limit and not last and not asked_for_none:
+        most = max(free, math.ceil(coarse.most * free / max(1, coarse.gaussians.count)))
     return replace(
         plan,
         kernels="cpu" if plan.kernels == "gpu" else plan.kernels,
         max_gaussians=most,
-        densify=not last and (plan.densify or most > free),
+        densify=most > free,
         initial="model",
         far_shell=False,
         gaps=False,
