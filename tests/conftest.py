@@ -10,6 +10,7 @@ import gc
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from zlib import crc32
 
 import pytest
 from hypothesis import settings
@@ -57,10 +58,17 @@ LONGEST = (
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The longest files first, then those with slow tests, so that no process is left alone with one at the end."""
+    """The longest files first, then those with slow tests, so that no process is left alone with one at the end.
+
+    The others are shuffled, by a hash of their paths: in the order of folders, files that wait for browsers and
+    services would run side by side, and later those that compute.
+    """
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     first = {FOLDER / name: place for place, name in enumerate(LONGEST)}
-    items.sort(key=lambda item: (first.get(item.path, len(first)), item.path not in slow))
+    places = {
+        path: crc32(path.relative_to(FOLDER).as_posix().encode()) for path in {item.path for item in items}
+    }
+    items.sort(key=lambda item: (first.get(item.path, len(first)), item.path not in slow, places[item.path]))
 
 
 @pytest.fixture(autouse=True)

@@ -13,6 +13,10 @@ from splatmill_server.base.problems import ProblemError
 WEB = Path(__file__).parents[1] / "web"
 """Where the viewer lies: `page/viewer.js` with what it imports, and PlayCanvas in `vendor/`."""
 
+WHOLE, IN_PARTS, MANY = "sog", "lod.zip", 2**18
+"""Keys of the formats that the file holds: of a model of more than MANY Gaussians the one with levels of detail, of
+which the viewer draws as many as a browser can. The page's are in `page/viewer/small_file.js`."""
+
 MOST_CAMERAS = 400
 """Cameras that the file holds. They tell its viewer where up is and where to look."""
 
@@ -52,6 +56,11 @@ try {
 """
 
 
+def held_format(gaussians: int) -> str:
+    """The key of the format in which the file holds a model of so many Gaussians."""
+    return IN_PARTS if gaussians > MANY else WHOLE
+
+
 def single_file(
     name: str,
     packed: bytes,
@@ -59,11 +68,13 @@ def single_file(
     antialias: bool,
     presentation: Presentation | None = None,
     poster: bytes | None = None,
+    *,
+    levels: bool = False,
 ) -> bytes:
     """Return the HTML file of a model.
 
     name: the title.
-    packed: the model as a `.sog`, the smallest format that the viewer draws.
+    packed: the model as a `.sog`, the smallest format that the viewer draws, or with `levels` as a `.lod.zip`.
     cameras: those of its photos, whose names are left out.
     antialias: whether the model was trained with antialiasing.
     presentation: how its owner wants it to be shown; None: as ever.
@@ -79,6 +90,7 @@ def single_file(
         "up": cameras.up,
         "antialias": antialias,
         "label": name,
+        "levels": levels,
         "background": shown.background,
         "presentation": shown.model_dump(mode="json", exclude={"start_view"}),
         **({"camera": view.model_dump(mode="json", exclude_none=True)} if view else {}),

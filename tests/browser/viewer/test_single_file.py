@@ -10,6 +10,7 @@ import io
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from PIL import Image
 from playwright.sync_api import Browser
@@ -17,7 +18,7 @@ from playwright.sync_api import Browser
 from splatmill.schema import Annotation, CameraSpec, ModelCamera, ModelCameras, Presentation
 from splatmill_server.responses.single_file import single_file
 from splatmill_worker.render_service.encoding import camera_of
-from splatmill_worker.splat.formats import ply, sog
+from splatmill_worker.splat.formats import ply, registry
 from splatmill_worker.splat.render import render
 from tests.support.ball import write_ply
 from tests.support.programs import npm_package
@@ -28,7 +29,10 @@ FLOOR = 34.0
 """PSNR in dB of the file's picture against our renderer's, as in test_viewer."""
 
 
-def test_the_file_draws_the_model_and_asks_for_nothing(browser: Browser, tmp_path: Path) -> None:
+@pytest.mark.parametrize("levels", [False, True], ids=["sog", "lod.zip"])
+def test_the_file_draws_the_model_and_asks_for_nothing(
+    browser: Browser, tmp_path: Path, levels: bool
+) -> None:
     npm_package("playcanvas")  # it is in the file
     write_ply(tmp_path / "model.ply", 800)
     scene = ply.read(tmp_path / "model.ply").gaussians
@@ -37,13 +41,15 @@ def test_the_file_draws_the_model_and_asks_for_nothing(browser: Browser, tmp_pat
         cameras=[ModelCamera(name=f"</script>{i}", camera=spec) for i, spec in enumerate(specs)]
     )
     name = 'A ball </title><script>throw "no"</script>'
-    sog.write(tmp_path / "model.sog", scene)
+    packed = tmp_path / ("model.lod.zip" if levels else "model.sog")
+    registry.write(packed, scene)
     shown_as = Presentation(
         start_view=CameraSpec.looking_at((1, -4, 0.5), (0, 0, 0), width=480, height=360),
         annotations=[Annotation(point=(0, -1, 0), text="</script>the top")],
     )
-    packed = (tmp_path / "model.sog").read_bytes()
-    made = single_file(name, packed, cameras, antialias=False, presentation=shown_as)
+    made = single_file(
+        name, packed.read_bytes(), cameras, antialias=False, presentation=shown_as, levels=levels
+    )
     (tmp_path / "model.html").write_bytes(made)
     context = browser.new_context(viewport={"width": 480, "height": 360}, offline=True)
     try:

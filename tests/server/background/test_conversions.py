@@ -7,6 +7,7 @@ Not proved here: the formats themselves (tests/worker/splat/formats).
 from __future__ import annotations
 
 import base64
+import re
 import signal
 import subprocess
 from concurrent.futures import ThreadPoolExecutor
@@ -27,6 +28,7 @@ from splatmill.schema import (
     ModelCameras,
 )
 from splatmill.sdk.client import Client
+from splatmill_server.responses import single_file
 from splatmill_server.responses.single_file import WEB
 from splatmill_worker.splat.formats import registry
 from tests.support.ball import write_ply
@@ -193,6 +195,26 @@ def test_the_model_with_its_viewer_in_one_file(app: ServedApp) -> None:
     assert answer.headers["content-security-policy"] == "sandbox allow-scripts"
     model = app.service.storage.get(layout.conversion(MODEL, "sog"))
     assert base64.b64encode(model) in answer.content
+
+
+def test_a_large_model_is_in_the_file_in_levels(app: ServedApp, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not (WEB / "vendor/playcanvas").is_dir():
+        pytest.skip("the file needs PlayCanvas, which npm installs")
+    monkeypatch.setattr(single_file, "MANY", 399)  # the model has 400 Gaussians
+    answer = app.http.get(f"/v1/models/{MODEL}/download/html")
+    assert answer.status_code == 200
+    model = app.service.storage.get(layout.conversion(MODEL, "lod.zip"))
+    assert base64.b64encode(model) in answer.content
+    assert b'"levels": true' in answer.content
+
+
+def test_the_page_and_the_file_hold_the_same_format() -> None:
+    source = (WEB / "page/viewer/small_file.js").read_text()
+    assert f'WHOLE = "{single_file.WHOLE}"' in source
+    assert f'IN_PARTS = "{single_file.IN_PARTS}"' in source
+    assert re.findall(r"MANY = 2 \*\* (\d+);", source) == [str(single_file.MANY.bit_length() - 1)]
+    assert single_file.held_format(single_file.MANY) == "sog"
+    assert single_file.held_format(single_file.MANY + 1) == "lod.zip"
 
 
 def test_the_sdk_and_the_command_line_download_formats(app: ServedApp, tmp_path: Path) -> None:

@@ -24,7 +24,6 @@ from splatmill_worker import pipeline
 from splatmill_worker.kernels.gpu.device import absence
 from splatmill_worker.splat.formats import registry
 from splatmill_worker.splat.gaussians import concatenate
-from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.plan.rates import RateSchedule, boost_of
 from splatmill_worker.tiles import coarse_model, command, joined
 from splatmill_worker.tiles.folder import DONE, PlanFolder, facts_of
@@ -147,22 +146,15 @@ def test_a_tile_adds_gaussians_where_a_limit_stopped_the_coarse_training(whole: 
     path = PlanFolder.open(whole).ended()["coarse"].path
     assert path is not None
     coarse = coarse_model.read(path)
-    count = coarse.gaussians.count
-
-    def plan_of(limit: int, last: bool = False, **changes: object) -> Plan:
-        plan = replace(coarse.plan, max_gaussians=limit, **changes)
-        return tile_plan(replace(coarse, plan=plan), 500, 11, last=last)
-
-    stopped, ended = plan_of(count), plan_of(count + 1)
+    assert coarse.limited == (coarse.gaussians.count == coarse.plan.max_gaussians)
+    stopped = tile_plan(replace(coarse, limited=True), 500, 11)
     assert stopped.densify
-    assert stopped.max_gaussians == pytest.approx(3000 * 500 / count, abs=1)
-    assert (ended.densify, ended.max_gaussians) == (False, 500)
-    last = plan_of(count, last=True)
-    assert (last.densify, last.max_gaussians) == (False, 500)
-    started_full = plan_of(count, densify=False)
-    assert started_full.densify, "the coarse training began with as many as it may have"
-    asked = plan_of(count, densify=False, forced=("densify",))
-    assert (asked.densify, asked.max_gaussians) == (False, 500)
+    assert stopped.max_gaussians == pytest.approx(3000 * 500 / coarse.gaussians.count, abs=1)
+    for ended in (
+        tile_plan(replace(coarse, limited=False), 500, 11),
+        tile_plan(replace(coarse, limited=True), 500, 11, last=True),
+    ):
+        assert (ended.densify, ended.max_gaussians) == (False, 500)
 
 
 def test_a_tile_sets_no_photo_aside_that_the_coarse_model_was_trained_on(whole: Path) -> None:

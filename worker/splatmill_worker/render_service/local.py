@@ -19,9 +19,10 @@ from splatmill.files import atomic_write, replacing
 from splatmill.schema import CameraSpec, ModelCameras, OrbitRequest, RenderRequest
 from splatmill_worker.errors import ModelUnreadable
 from splatmill_worker.film import Film
+from splatmill_worker.render_service import leveled_model
 from splatmill_worker.render_service.encoding import render_frame, render_image
 from splatmill_worker.render_service.model_cache import LoadedModel, antialias_of
-from splatmill_worker.splat.formats import registry, streamed_views
+from splatmill_worker.splat.formats import registry
 from splatmill_worker.splat.formats.contents import Contents
 from splatmill_worker.splat.lod.choice import TOLERANCE
 from splatmill_worker.splat.orbit import DEFAULT_FOV, Float, orbit_cameras, path_of
@@ -105,14 +106,14 @@ def loaded(model: Path) -> Iterator[LoadedModel]:
 
     Raises ModelUnreadable, and FileNotFoundError.
     """
-    with streamed_views.opened(model) as leveled:
+    with leveled_model.opened(model) as leveled:
         contents = _checked(model, registry.read(model) if leveled is None else leveled.overview)
         reads = None if leveled is None else leveled.seen_by
         yield LoadedModel(str(model), "", contents.gaussians, bool(contents.antialiased), 0, reads=reads)
         if leveled is not None and leveled.tolerance > TOLERANCE:
             print(
-                f"{model.name}: memory held the Gaussians of a view only where they may be "
-                f"{leveled.tolerance:g} pixels from their places; {TOLERANCE:g} are usual.",
+                f"{model.name}: memory did not hold all that a view shows, so that coarser levels were drawn, within "
+                f"{leveled.tolerance:g} px of their places; {TOLERANCE:g} px are usual.",
                 file=sys.stderr,
             )
 

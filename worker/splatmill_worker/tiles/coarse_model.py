@@ -38,6 +38,7 @@ class Coarse:
     held_out: the photos that were not trained on.
     facts: what was measured before the training (`Facts.as_dict`).
     disagreements: how far the training photos disagree with one another.
+    limited: whether a limit stopped the training from adding Gaussians (`Trained.limited`).
     """
 
     gaussians: Gaussians
@@ -49,11 +50,7 @@ class Coarse:
     held_out: tuple[TrainingView, ...]
     facts: dict[str, Any]
     disagreements: tuple[Disagreement, ...]
-
-    @property
-    def stopped_by_limit(self) -> bool:
-        """Whether the training has as many Gaussians as it was allowed, which is less than the whole scene may have."""
-        return self.gaussians.count >= self.plan.max_gaussians
+    limited: bool
 
     @cached_property
     def far(self) -> Tensor:
@@ -74,6 +71,7 @@ class Coarse:
             "steps": self.steps,
             "facts": plain(self.facts),
             "disagreements": [each[:-1] for each in self.disagreements],
+            "limited": self.limited,
         }
         atomic_write(folder / FACTS, json.dumps(document, indent=1))
 
@@ -106,6 +104,7 @@ def read(folder: Path) -> Coarse:
         read_photos(folder / HELD_OUT),
         document["facts"],
         _disagreements(folder, document["disagreements"]),
+        bool(document["limited"]),
     )
 
 

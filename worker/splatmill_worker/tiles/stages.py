@@ -172,6 +172,7 @@ def _coarse(context: Context, stages: Stages) -> dict[str, Any]:
         photos.held_out,
         planned.facts.as_dict(),
         trained.disagreements,
+        trained.limited,
     ).write(context.run.out)
     held_out = trained.held_out
     return {

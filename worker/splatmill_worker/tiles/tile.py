@@ -158,8 +158,8 @@ def tile_plan(coarse: Coarse, free: int, photos: int, *, last: bool = False) -> 
     of the rates, MANY_VISITS over that number: what so many steps learn at high rates is rather the photos than the
     scene (decisions: tile-rates).
 
-    Gaussians are added where the limit of the coarse training stopped it. Else it has made as many as the photos ask
-    for, and those that a tile would add learn what single photos show (decisions: tile-growth).
+    Gaussians are added where a limit stopped the coarse training. Else it has made as many as the photos ask for, and
+    those that a tile would add learn what single photos show (decisions: tile-growth).
     """
     plan, schedule = coarse.plan, coarse.plan.schedule
     until, boost = 1.0 - LAST, schedule.annealing.boost
@@ -177,8 +177,8 @@ def tile_plan(coarse: Coarse, free: int, photos: int, *, last: bool = False) -> 
         begin=skipped + (1.0 - skipped) * begin,
         end=skipped + (1.0 - skipped) * end,
     )
-    most, asked_for_none = free, not plan.densify and "densify" in plan.forced
-    if coarse.stopped_by_limit and not last and not asked_for_none:
+    most = free
+    if coarse.limited and not last:
         most = max(free, math.ceil(coarse.most * free / max(1, coarse.gaussians.count)))
     return replace(
         plan,

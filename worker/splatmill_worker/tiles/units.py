@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from splatmill.schema import TrainOptions
 
-FORMAT = 5
+FORMAT = 6
 """Version of the plan's format and of what its units make: another one makes everything anew."""
 
 CAMERA_OPTIONS = ("sfm_effort", "matcher", "mapper", "max_video_frames", "scale", "seed", "start")

@@ -30,7 +30,7 @@ from splatmill_server.requests.parameters import JSON_ONLY, Cursor, Favourite, L
 from splatmill_server.responses.files import attachment
 from splatmill_server.responses.forward import CLIENT_GONE, forward, while_connected
 from splatmill_server.responses.model_outputs import file_name, model_file, model_in_format, rendered_by_query
-from splatmill_server.responses.single_file import single_file
+from splatmill_server.responses.single_file import IN_PARTS, held_format, single_file
 from splatmill_server.routes.openapi import (
     CAMERA,
     CONVERTED,
@@ -144,19 +144,21 @@ def get_formats(service: Shared, model_id: ModelId) -> ModelDownloads:
 )
 async def download_html(service: Shared, who: Who, model_id: ModelId, request: Request) -> Response:
     """Download a model with its viewer in one HTML file, which needs no server and sends no request."""
-    path = await while_connected(request, service.conversions.get_path(model_id, DOWNLOADS["sog"], who))
+    model = await run_in_threadpool(service.models.get, model_id)
+    key = held_format(model.gaussians)
+    path = await while_connected(request, service.conversions.get_path(model_id, DOWNLOADS[key], who))
     if path is None:
         return Response(status_code=CLIENT_GONE)
 
     def made() -> bytes:
-        model = service.models.get(model_id)
         cameras = service.models.get_cameras(model_id)
         antialias = service.models.antialias(model_id)
         presentation, poster = service.presentations.get(model_id), None
         if any(file.name == POSTER for file in model.files):
             poster = service.storage.get(layout.model_file(model_id, POSTER))
         packed, name = service.storage.get(path), model.name or model_id
-        return single_file(name, packed, cameras, antialias, presentation, poster)
+        levels = key == IN_PARTS
+        return single_file(name, packed, cameras, antialias, presentation, poster, levels=levels)
 
     headers = {
         "Content-Disposition": attachment(await run_in_threadpool(file_name, service, model_id, ".html")),

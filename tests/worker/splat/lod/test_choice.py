@@ -1,11 +1,11 @@
 """Proves which leaves a view has, and which levels are drawn: by distance, within what is allowed.
 
-Does not prove what the errors of levels are (test_levels.py), nor how the picture looks (test_streamed_views.py).
+Does not prove what the errors of levels are (test_levels.py), nor how the picture looks (test_leveled_model.py).
 """
 
 from __future__ import annotations
 
-import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -55,11 +55,24 @@ def test_where_nothing_is_allowed_all_have_the_coarsest_level() -> None:
     leaves = boxes((0, 0, 0), (0, 0, 5))
     choice = choose(leaves, AHEAD, 0, 0.25)
     assert choice.levels.tolist() == [2, 2]
-    assert choice.tolerance == math.inf
+    assert choice.tolerance == 128.0, "an error of 0.1 at 0.05 diagonals of the box is 115 pixels"
 
 
 def test_in_a_leaf_the_finest_level_is_drawn() -> None:
-    assert choose(boxes((0, 0, 0)), AHEAD, 10**6, 1000.0).levels.tolist() == [0]
+    assert choose(boxes((0, 0, 0)), AHEAD, 10**6).levels.tolist() == [0]
+
+
+def test_errors_that_fall_or_begin_above_none_leave_no_hole() -> None:
+    leaves = replace(boxes((0, 0, 1), (0, 0, 5)), errors=np.array([[0.5, 0.2, 0.1], [-1.0, 0.5, 0.01]]))
+    assert choose(leaves, AHEAD, 10**6).levels.tolist() == [0, 0]
+
+
+@pytest.mark.parametrize("size", [1e-29, 1e29])
+def test_extreme_scenes_have_a_choice(size: float) -> None:
+    leaves = boxes((0, 0, 5))
+    leaves = Leaves(leaves.low * size, leaves.high * size, leaves.errors * 1e29, leaves.counts)
+    with np.errstate(all="raise"):
+        assert choose(leaves, AHEAD, 0).levels.tolist() == [2]
 
 
 def test_what_projects_into_the_picture_is_in_view() -> None:

@@ -275,11 +275,16 @@ def member(name: str) -> zipfile.ZipInfo:
 def contents(files: sog_files.Files) -> Contents:
     """The model in the files of a SOG. Raises what `read` turns into ModelUnreadable."""
     gaussians, meta = rows(files)
+    return Contents.of(gaussians, *stated(meta))
+
+
+def stated(meta: dict[str, Any]) -> tuple[Offset, bool | None]:
+    """The offset and `Contents.antialiased` that a `meta.json` states. Raises as `contents`."""
     offset = NO_OFFSET
     if isinstance(meta.get("splatmill"), dict):
         x, y, z = _numbers(meta["splatmill"]["offset"], 3).tolist()
         offset = (x, y, z)
-    return Contents.of(gaussians, offset, _antialiased(meta))
+    return offset, _antialiased(meta)
 
 
 def rows(files: sog_files.Files) -> tuple[Gaussians, dict[str, Any]]:

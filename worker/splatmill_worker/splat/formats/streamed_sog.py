@@ -303,21 +303,25 @@ def finest(index: Any) -> list[str]:
     index: the document in a `lod-meta.json`. Raises ValueError, KeyError, TypeError, IndexError or AttributeError for
     another one.
     """
-    if index["version"] != VERSION:
-        raise ValueError(f"its version is {index['version']!r:.20}, and only version {VERSION} is read")
-    found = dict[int, None]()
-    nodes = [index["tree"]]
-    while nodes:
-        node = nodes.pop()
-        nodes += reversed(node.get("children", []))
-        if "0" in node.get("lods", {}):
-            found[node["lods"]["0"]["file"]] = None
+    found = dict.fromkeys(node["lods"]["0"]["file"] for node in leaves(index) if "0" in node["lods"])
     names = [*dict.fromkeys(index["filenames"][file] for file in found)]
     names += [index["environment"]] if index.get("environment") else []
     if not names:
         raise ValueError("its tree has no leaf with level 0")
     check_names(names)
     return names
+
+
+def leaves(index: Any) -> Iterator[Any]:
+    """The nodes of the tree of an index that have levels, in its order. Raises as `finest`."""
+    if index["version"] != VERSION:
+        raise ValueError(f"its version is {index['version']!r:.20}, and only version {VERSION} is read")
+    nodes = [index["tree"]]
+    while nodes:
+        node = nodes.pop()
+        nodes += reversed(node.get("children", []))
+        if "lods" in node:
+            yield node
 
 
 def check_names(names: Sequence[str]) -> None:

@@ -13,7 +13,11 @@ TOLERANCE = 0.25
 """Pixels by which what is seen may be drawn from its place, root mean square (decisions: levels-in-view)."""
 
 BESIDE = 2.0
-"""Pixels beside the picture of which something may reach into it: projection widens every Gaussian."""
+"""Pixels beside the picture of which something may reach into it, as projection widens every Gaussian. Large ones seen
+far from the axis are widened further; their edges are left out."""
+
+NEAREST = 0.05
+"""Least distance at which the errors of a leaf are seen, over the diagonal of its box, wherever the camera is."""
 
 Float = npt.NDArray[np.float64]
 
@@ -52,10 +56,11 @@ def choose(leaves: Leaves, camera: Camera, most: int, tolerance: float = TOLERAN
     """
     visible = in_view(leaves, camera)
     centre = camera.center
-    away = np.maximum(np.maximum(leaves.low - centre, centre - leaves.high), 0.0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        shifts = leaves.errors * max(camera.fx, camera.fy) / np.linalg.norm(away, axis=1)[:, None]
-    shifts[leaves.errors == 0.0] = 0.0  # also where the camera stands in the box
+    away = np.linalg.norm(np.maximum(np.maximum(leaves.low - centre, centre - leaves.high), 0.0), axis=1)
+    away = np.maximum(away, NEAREST * np.linalg.norm(leaves.high - leaves.low, axis=1))
+    shifts = leaves.errors * max(camera.fx, camera.fy) / np.maximum(away, 1e-30)[:, None]
+    shifts[:, 0] = 0.0  # there is nothing finer
+    shifts = np.maximum.accumulate(shifts, axis=1)
     coarsest = leaves.errors.shape[1] - 1
     everywhere = np.arange(len(visible))
     while True:

@@ -93,7 +93,8 @@ def _encoded(snapshot: Snapshot) -> dict[str, Any]:
 
 
 def _decoded(state: dict[str, Any]) -> Snapshot:
-    values = {name: state[NAMES.get(name, name)] for name in (each.name for each in fields(RunState))}
+    names = {each.name: NAMES.get(each.name, each.name) for each in fields(RunState)}
+    values = {name: state[stored] for name, stored in names.items() if stored in state}
     values["budget"] = Budget(**values["budget"])
     values["curve"] = tuple(CurvePoint(**row) for row in values["curve"])
     values["upcoming"] = tuple(values["upcoming"])

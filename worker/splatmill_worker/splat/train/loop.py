@@ -76,6 +76,8 @@ class Trained:
     validation: names of the training views that were set aside for decisions.
     disagreements: how far each training photo disagrees with those around it, the largest first; without `validation`.
         Empty where they are not compared.
+    limited: whether the last densification would have added more Gaussians than it was allowed, or none was made since
+        training began with as many as it may have.
     """
 
     gaussians: Gaussians
@@ -92,6 +94,7 @@ class Trained:
     cameras_moved: float | None
     validation: tuple[str, ...] = ()
     disagreements: tuple[Disagreement, ...] = ()
+    limited: bool = False
 
 
 def train(
@@ -193,4 +196,10 @@ def _result(
         cameras_moved=None if run.poses is None else run.poses.pixels_moved(),
         validation=validation,
         disagreements=disagreements,
+        limited=run.state.limited or started_full(run.plan, run.engine.count),
     )
+
+
+def started_full(plan: Plan, count: int) -> bool:
+    """Whether no Gaussians were added because there were as many as the plan allows, and not because of an option."""
+    return not plan.densify and "densify" not in plan.forced and count >= plan.max_gaussians

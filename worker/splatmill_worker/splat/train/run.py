@@ -299,12 +299,13 @@ class TrainingRun:
             allowed = min(allowed, self.plan.gaussians_within(self.plan.max_memory, best=watched))
         within = self.plan.schedule.decay_within
         try:
-            densify(
+            change = densify(
                 self.engine,
                 allowed=allowed,
                 opacity_decay=self.plan.schedule.opacity_decay,
                 decay_within=math.inf if within is None else within,
             )
+            self.state.limited = change.unsplit > 0
         except MemoryError as short:
             raise TrainingFailed(FailureName.memory, f"{short}", step=self.state.step) from short
         if self.engine.count == 0:

@@ -25,6 +25,7 @@ class RunState:
     rate_scale: factor on all learning rates; every roll-back from a divergence halves it.
     upcoming: indices of the photos still to come in this round, the next one last.
     ever_visible: whether any photo has shown a Gaussian.
+    limited: whether the last densification would have added more Gaussians than it was allowed.
     """
 
     budget: Budget
@@ -36,6 +37,7 @@ class RunState:
     rate_scale: float = 1.0
     upcoming: tuple[int, ...] = ()
     ever_visible: bool = False
+    limited: bool = False
 
 
 @dataclass(frozen=True)

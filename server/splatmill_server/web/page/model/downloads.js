@@ -5,6 +5,7 @@ import { get, request } from "../api.js";
 import { h } from "../dom.js";
 import { bytes } from "../format.js";
 import { noticeOf } from "../shell.js";
+import { smallFormat } from "../viewer/small_file.js";
 
 /** @import {Shown} from "./model.js" */
 
@@ -35,9 +36,6 @@ const FILES = {
   "poster.jpg": "The picture from the start view, which links show",
 };
 
-/** Key of the format that the one-file page holds. */
-const IN_ONE_FILE = "sog";
-
 /**
  * @param {HTMLElement} section
  * @param {Shown} shown
@@ -66,7 +64,7 @@ export async function showDownloads(section, { model, address }) {
     if (focused) [...body.querySelectorAll("a")].find((link) => link.getAttribute("href") === focused)?.focus();
   };
   const tell = async () => {
-    const formats = formatRows(await get(`${address}/formats`), address);
+    const formats = formatRows(await get(`${address}/formats`), address, model.gaussians);
     show([...formats, ...files.filter((row) => row.name !== "model.ply")]);
   };
   /** Wait until the file of a row has been made, which its download has asked for. @param {Row} row */
@@ -96,9 +94,10 @@ export async function showDownloads(section, { model, address }) {
  * The formats that the server converts the model to, then the page in one file.
  * @param {any} answer that of `/v1/models/{id}/formats`
  * @param {string} address that of the model
+ * @param {number} gaussians of the model
  * @returns {Row[]}
  */
-function formatRows(answer, address) {
+function formatRows(answer, address, gaussians) {
   /** @type {Row[]} */
   const rows = answer.formats.map((/** @type {any} */ { format, name, address: href, loses, readers, bytes: size, conversion }) => {
     const plain = format === "ply";
@@ -112,11 +111,12 @@ function formatRows(answer, address) {
       ...(plain ? { psnr: answer.psnr === null ? "" : `${answer.psnr.toFixed(2)} dB` } : qualityOf(conversion)),
     };
   });
-  const held = rows[answer.formats.findIndex((/** @type {any} */ { format }) => format === IN_ONE_FILE)];
+  const inOneFile = smallFormat(gaussians);
+  const held = rows[answer.formats.findIndex((/** @type {any} */ { format }) => format === inOneFile)];
   if (held) {
     rows.push({
       ...held, name: "Page in one file (.html)", href: `${address}/download/html`, size: null, loses: undefined,
-      what: "The model with its viewer, to open without a server or to mail. It holds the .sog.",
+      what: `The model with its viewer, to open without a server or to mail. It holds the .${inOneFile}.`,
     });
   }
   return rows;

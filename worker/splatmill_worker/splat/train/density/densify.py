@@ -31,10 +31,11 @@ LONGEST, OTHERS, OPACITY = 0.5, 0.85, 0.6
 
 
 class Change(NamedTuple):
-    """How many Gaussians a densification added and removed."""
+    """How many Gaussians a densification added and removed, and how many it did not split because of the limit."""
 
     added: int
     removed: int
+    unsplit: int
 
 
 def densify(
@@ -54,7 +55,8 @@ def densify(
     score = engine.plain_sum / engine.visible_count.clamp_min(1)
     rows = Rows.of(engine)
     kept = prune.keep(rows.gaussians, engine.max_extent)
-    split = largest(kept & (score > THRESHOLD), score, allowed - int(kept.sum()))
+    candidates = kept & (score > THRESHOLD)
+    split = largest(candidates, score, allowed - int(kept.sum()))
     new = halves(rows.gaussians.select(split))
     rows = rows.keep(kept & ~split)
     if opacity_decay < 1.0:
@@ -64,7 +66,7 @@ def densify(
     rows = rows.grown(new)
     rows.into(engine)
     added = int(split.sum())
-    return Change(added=added, removed=before + added - engine.count)
+    return Change(added, before + added - engine.count, int(candidates.sum()) - added)
 
 
 def largest(candidates: Tensor, score: Tensor, limit: int) -> Tensor:
