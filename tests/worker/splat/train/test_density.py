@@ -76,7 +76,7 @@ def test_a_split_gaussian_gives_way_to_two_and_the_others_keep_their_moments() -
     before = gaussians(6)
     engine = Held(before, torch.tensor([0.0, 1e-3, 0.0, 0.0, 3e-4, 1e-4]))
     change = split(engine)
-    assert (change.added, change.removed) == (2, 0)
+    assert change == Change(added=2, removed=0, unsplit=0)
     assert engine.count == 8
     assert torch.equal(engine.held.means[:4], before.means[[0, 2, 3, 5]])
     assert engine.exp_avg[:4, 0].tolist() == [0.0, 2.0, 3.0, 5.0]
@@ -117,7 +117,7 @@ def test_halves_come_first_halves_first() -> None:
 def test_the_budget_takes_the_largest_scores() -> None:
     before = gaussians(8)
     engine = Held(before, torch.arange(8) * 1e-3)
-    split(engine, allowed=10)
+    assert split(engine, allowed=10) == Change(added=2, removed=0, unsplit=5)
     assert engine.count == 10
     assert torch.equal(engine.held.means[:6], before.means[:6])
 

@@ -23,7 +23,7 @@ from splatmill_worker.splat.plan.rates import Annealing, boost_of
 from splatmill_worker.splat.start import frusta
 from splatmill_worker.splat.start.points import from_points
 from splatmill_worker.splat.train import checkpoint, curve, observers
-from splatmill_worker.splat.train.loop import Hooks, train
+from splatmill_worker.splat.train.loop import Hooks, started_full, train
 from splatmill_worker.splat.train.observers import TrainingProgress
 from splatmill_worker.splat.train.renderer import evaluation_background
 from splatmill_worker.splat.train.run import TrainingRun
@@ -77,6 +77,15 @@ def test_there_are_never_more_gaussians_than_allowed() -> None:
     assert trained.held_out is not None
     assert trained.held_out.psnr > 17.0
     assert trained.gaussians.count <= 2200
+    assert trained.limited
+
+
+def test_a_run_that_may_add_none_says_whether_a_limit_is_why() -> None:
+    full = plan(10, densify=False, max_gaussians=100)
+    assert started_full(full, 100)
+    assert not started_full(full, 99)
+    assert not started_full(replace(full, forced=("densify",)), 100)
+    assert not started_full(replace(full, densify=True), 100)
 
 
 @pytest.mark.slow
