@@ -24,7 +24,7 @@ from tests.support.training import first_engine, plan, split
 
 FILE_KEYS = {
     "format", "parameters", "exp_avg", "exp_avg_sq", "step", "seconds", "rows", "recoveries", "rate_scale", "order",
-    "random", "views", "poses", "budget", "shortened", "most", "ever_saw", "best",
+    "random", "views", "poses", "budget", "shortened", "most", "ever_saw", "limited", "best",
 }  # fmt: skip
 
 
