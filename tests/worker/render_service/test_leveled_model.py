@@ -240,6 +240,20 @@ def test_what_cannot_be_read_at_all_is_refused_with_the_reason(
         pass
 
 
+def test_a_leaf_that_is_drawn_over_and_over_fills_no_memory(written: Path, tmp_path: Path) -> None:
+    def repeat(index: dict[str, Any]) -> None:
+        index["tree"] = {"children": [leaf(index)] * 15_000}
+
+    with leveled_model.opened(changed(written, tmp_path, repeat)) as model:
+        assert model is not None
+        middle = np.mean(
+            [leaf(json.loads(written.read_bytes()))["bound"][side] for side in ("min", "max")], 0
+        )
+        camera = towards(float(middle[0]), 3).moved_to(middle - [0, 0, 3])
+        with pytest.raises(ModelUnreadable, match="made to fill the memory"):
+            model.seen_by(camera)
+
+
 def test_a_chunk_that_is_damaged_later_is_named(written: Path, tmp_path: Path) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(written.parent, copy)
