@@ -41,6 +41,9 @@ def pytest_collection_finish() -> None:
 
 FOLDER = Path(__file__).parent
 
+BROWSER = "browser"
+"""The folder whose tests share a browser."""
+
 LONGEST = (
     "service/test_kills.py",
     "docs/test_blocks.py",
@@ -60,15 +63,19 @@ LONGEST = (
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The longest files first, then those with slow tests, so that no process is left alone with one at the end.
 
-    The others are shuffled, by a hash of their paths: in the order of folders, files that wait for browsers and
-    services would run side by side, and later those that compute.
+    The others are shuffled, by a hash of their paths: in the order of folders, files that wait for services would run
+    side by side, and later those that compute. Those with a browser follow each other, as they share it.
     """
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     first = {FOLDER / name: place for place, name in enumerate(LONGEST)}
-    places = {
-        path: crc32(path.relative_to(FOLDER).as_posix().encode()) for path in {item.path for item in items}
-    }
-    items.sort(key=lambda item: (first.get(item.path, len(first)), item.path not in slow, places[item.path]))
+
+    def place(path: Path) -> tuple[int, bool, int]:
+        name = path.relative_to(FOLDER)
+        shuffled = crc32((BROWSER if name.parts[0] == BROWSER else name.as_posix()).encode())
+        return first.get(path, len(first)), path not in slow, shuffled
+
+    places = {path: place(path) for path in {item.path for item in items}}
+    items.sort(key=lambda item: places[item.path])
 
 
 @pytest.fixture(autouse=True)
