@@ -142,19 +142,22 @@ def test_a_tile_goes_on_where_the_coarse_model_stopped(whole: Path) -> None:
     assert late.left_out(50.0) == pytest.approx(0.2)
 
 
-def test_a_tile_adds_gaussians_where_a_limit_stopped_the_coarse_training(whole: Path) -> None:
+def test_a_tile_adds_gaussians_for_as_long_as_one_piece_or_as_a_limit_stopped_the_coarse_training(
+    whole: Path,
+) -> None:
     path = PlanFolder.open(whole).ended()["coarse"].path
     assert path is not None
     coarse = coarse_model.read(path)
     assert coarse.limited == (coarse.gaussians.count == coarse.plan.max_gaussians)
-    stopped = tile_plan(replace(coarse, limited=True), 500, 11)
-    assert stopped.densify
-    assert stopped.max_gaussians == pytest.approx(3000 * 500 / coarse.gaussians.count, abs=1)
-    for ended in (
-        tile_plan(replace(coarse, limited=False), 500, 11),
-        tile_plan(replace(coarse, limited=True), 500, 11, last=True),
-    ):
-        assert (ended.densify, ended.max_gaussians) == (False, 500)
+    for limited, until in ((True, 0.7 / 0.8), (False, (0.7 - 0.5) / (0.5 * 0.8))):
+        growing = tile_plan(replace(coarse, limited=limited), 500, 11)
+        assert growing.densify
+        assert growing.max_gaussians == pytest.approx(3000 * 500 / coarse.gaussians.count, abs=1)
+        assert growing.schedule.densify_until == pytest.approx(until)
+        last = tile_plan(replace(coarse, limited=limited), 500, 11, last=True)
+        assert (last.densify, last.max_gaussians) == (False, 500)
+    asked = replace(coarse, plan=replace(coarse.plan, densify=False, forced=("densify",)))
+    assert not tile_plan(asked, 500, 11).densify
 
 
 def test_a_tile_sets_no_photo_aside_that_the_coarse_model_was_trained_on(whole: Path) -> None:

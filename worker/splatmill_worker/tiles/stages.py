@@ -32,12 +32,8 @@ from splatmill_worker.splat.plan.plan import Kernels, Plan
 from splatmill_worker.tiles import coarse_model, joined
 from splatmill_worker.tiles.cells import divide
 from splatmill_worker.tiles.folder import PlanFolder, Run, facts_of
-from splatmill_worker.tiles.tile import Tile, train_tile
+from splatmill_worker.tiles.tile import COARSE_SHARE, Tile, train_tile
 from splatmill_worker.tiles.units import ScenePlan, seam_name, tile_name, tile_number
-
-STEPS_SHARE = 0.5
-"""Share of the steps of a whole run that the coarse training takes. A tile then uses each of its photos as often as the
-coarse training did."""
 
 CHECKPOINTS, PLAN_FILE = "checkpoints", "plan.json"
 """The folder of the checkpoints and the file of the plan of a training, in its work folder."""
@@ -254,13 +250,13 @@ def _most(cameras: Cameras, job: Job) -> int:
 
 
 def _shorter(plan: Plan) -> Plan:
-    """The plan of a whole run with STEPS_SHARE of its steps."""
+    """The plan of a whole run with COARSE_SHARE of its steps."""
     schedule = plan.schedule
     budget = schedule.budget
     assert budget.steps is not None
 
     def share(steps: int) -> int:
-        return max(1, round(STEPS_SHARE * steps))
+        return max(1, round(COARSE_SHARE * steps))
 
     return replace(
         plan,

@@ -39,6 +39,10 @@ MARGIN = 0.05
 """Width of what is trained around a cell and then left to the tiles beside it, over the longest side of the box that
 holds four fifths of the coarse model."""
 
+COARSE_SHARE = 0.5
+"""Share of the steps of a whole run that the coarse training takes. A tile then uses each of its photos as often as the
+coarse training did."""
+
 LAST = 0.2
 """Share of the steps of a tile that are taken beside the trained tiles around it (decisions: seams)."""
 
@@ -158,8 +162,9 @@ def tile_plan(coarse: Coarse, free: int, photos: int, *, last: bool = False) -> 
     of the rates, MANY_VISITS over that number: what so many steps learn at high rates is rather the photos than the
     scene (decisions: tile-rates).
 
-    Gaussians are added where a limit stopped the coarse training. Else it has made as many as the photos ask for, and
-    those that a tile would add learn what single photos show (decisions: tile-growth).
+    Gaussians are added up to the share of both trainings at which one piece adds the last: later ones learn what single
+    photos show. Where a limit stopped the coarse training from adding them, they are added for as long as it had
+    (decisions: tile-growth).
     """
     plan, schedule = coarse.plan, coarse.plan.schedule
     until, boost = 1.0 - LAST, schedule.annealing.boost
@@ -177,9 +182,11 @@ def tile_plan(coarse: Coarse, free: int, photos: int, *, last: bool = False) -> 
         begin=skipped + (1.0 - skipped) * begin,
         end=skipped + (1.0 - skipped) * end,
     )
-    most = free
-    if coarse.limited and not last:
+    most, densify_until = free, schedule.densify_until
+    if not last and (plan.densify or "densify" not in plan.forced):
         most = max(free, math.ceil(coarse.most * free / max(1, coarse.gaussians.count)))
+    if not coarse.limited:
+        densify_until = max(0.0, (densify_until - COARSE_SHARE) / (1.0 - COARSE_SHARE))
     return replace(
         plan,
         kernels="cpu" if plan.kernels == "gpu" else plan.kernels,
@@ -199,7 +206,7 @@ def tile_plan(coarse: Coarse, free: int, photos: int, *, last: bool = False) -> 
             expected_steps=steps,
             longest=None,
             resolution=((0, 1),),
-            densify_until=min(1.0, schedule.densify_until / until),
+            densify_until=min(1.0, densify_until / until),
             annealing=annealing,
             earlier_visits=earlier + (first / photos if last else 0.0),
         ),
