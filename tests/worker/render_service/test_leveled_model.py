@@ -6,6 +6,7 @@ Does not prove the choice of levels (tests/worker/splat/lod/test_choice.py), nor
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -237,6 +238,15 @@ def test_what_cannot_be_read_at_all_is_refused_with_the_reason(
 ) -> None:
     path = changed(written, tmp_path, change)
     with pytest.raises(ModelUnreadable, match=says), loaded(path):
+        pass
+
+
+@pytest.mark.parametrize("name", ["lod-meta.json", "m.lod.zip"])
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path, name: str) -> None:
+    with pytest.raises(FileNotFoundError), loaded(tmp_path / name):
+        pass
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(ModelUnreadable, match="not a regular file"), loaded(tmp_path / name):
         pass
 
 

@@ -125,16 +125,14 @@ class LeveledModel:
 @contextmanager
 def opened(path: Path) -> Iterator[LeveledModel | None]:
     """A model in levels of detail. None for a file of another format, and for one of which views cannot choose levels,
-    such as one that does not state their errors: it may still be read whole, or the reader says what it lacks.
-
-    Raises FileNotFoundError where there is none.
-    """
+    such as one that does not state their errors: it may still be read whole, or the reader says what it lacks."""
     found = format_of(path.name)
     source = {"lod-meta.json": streamed_sog.opened, ".lod.zip": streamed_zip.opened}.get(
         "" if found is None else found.suffix
     )
     with ExitStack() as stack:
-        model = None if source is None else _leveled(path, stack, source)
+        # A pipe would keep its reader waiting.
+        model = None if source is None or not path.is_file() else _leveled(path, stack, source)
         if model is None:
             stack.close()
         yield model
@@ -146,8 +144,6 @@ def _leveled(path: Path, stack: ExitStack, source: Callable[[Path], Any]) -> Lev
         if document.index.get("lodErrors") is not True:
             return None
         return LeveledModel(path, document.index, document.part)
-    except FileNotFoundError:
-        raise
     except (UnusablePicture, *streamed_sog.DAMAGE):
         return None
 
