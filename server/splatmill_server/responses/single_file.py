@@ -44,7 +44,9 @@ const text = (id) => document.getElementById(id).textContent;
 const said = document.getElementById("said");
 said.textContent = "The model is being unpacked.";
 try {
-  const bytes = Uint8Array.from(atob(text("model")), (letter) => letter.charCodeAt(0));
+  const letters = atob(text("model"));
+  const bytes = new Uint8Array(letters.length);
+  for (let i = 0; i < letters.length; i++) bytes[i] = letters.charCodeAt(i);
   const { presentation, ...options } = JSON.parse(text("options"));
   const box = document.getElementById("view");
   globalThis.view = await open(box, { bytes, ...options });

@@ -70,6 +70,7 @@ class LeveledModel:
         self._surroundings = gathered(0, 0, [])
         notes: tuple[str, ...] = ()
         if environment:
+            self._bytes += sog.header(part(environment)).bytes
             around = sog.contents(part(environment))
             self._surroundings, notes = around.gaussians, around.notes
             self._degree = max(self._degree, self._surroundings.degree)
@@ -87,7 +88,8 @@ class LeveledModel:
         """The Gaussians that `camera` draws: of each leaf in view the level that is within TOLERANCE pixels of its
         place, or a coarser one where memory holds no more. Raises ModelUnreadable for damaged files.
         """
-        most = self._room // (COPIES * parameter_bytes(self._degree)) - self._surroundings.count
+        room = min(self._room, limit())
+        most = room // (COPIES * parameter_bytes(self._degree)) - self._surroundings.count
         choice = choose(self._leaves, camera, most)
         self.tolerance = max(self.tolerance, choice.tolerance)
         with unreadable(self._path, streamed_zip.WHAT):
@@ -107,6 +109,7 @@ class LeveledModel:
                 chunk = self._chunk(self._names[file])
                 for first, many in zip(firsts[files == file], counts[files == file], strict=True):
                     yield _finite(chunk.select(slice(int(first), int(first + many))))
+                del chunk  # before the next is read
             yield surroundings
 
         return gathered(count, self._degree, pieces())

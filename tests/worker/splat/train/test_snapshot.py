@@ -118,6 +118,7 @@ def test_a_checkpoint_of_the_code_before_snapshots_is_resumed(tmp_path: Path) ->
         3000,
     )
     assert (run.state.shortened, run.state.ever_visible, run.state.upcoming) == (True, True, (4, 7, 1))
+    assert not run.state.limited
     assert run.state.budget.steps == 180
     assert run.clock.seconds == pytest.approx(3.5, abs=0.5)
     assert [point.step for point in run.state.curve] == [40, 80]
@@ -144,7 +145,9 @@ def test_the_file_has_the_keys_of_its_format(tmp_path: Path) -> None:
 
 
 def test_a_stored_snapshot_is_the_same_when_it_is_loaded(tmp_path: Path) -> None:
-    snapshot = advanced(a_run(course()), 30).snapshot()
+    run = advanced(a_run(course()), 30)
+    run.state.limited = True
+    snapshot = run.snapshot()
     checkpoint.save(tmp_path, snapshot)
     loaded = checkpoint.load(tmp_path)
     assert loaded is not None

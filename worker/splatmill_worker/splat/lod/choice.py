@@ -42,7 +42,8 @@ class Choice:
     """What a view draws.
 
     levels: of each leaf, int64 [leaves]; -1 for one that is not in view.
-    tolerance: pixels; larger than asked for where finer levels are more Gaussians than are allowed.
+    tolerance: pixels; larger than asked for where finer levels are more Gaussians than are allowed. Leaves nearer than
+        NEAREST are taken to be there.
     """
 
     levels: npt.NDArray[np.int64]

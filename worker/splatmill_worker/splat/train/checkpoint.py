@@ -93,8 +93,8 @@ def _encoded(snapshot: Snapshot) -> dict[str, Any]:
 
 
 def _decoded(state: dict[str, Any]) -> Snapshot:
-    names = {each.name: NAMES.get(each.name, each.name) for each in fields(RunState)}
-    values = {name: state[stored] for name, stored in names.items() if stored in state}
+    state = {"limited": False} | state  # files of before have none
+    values = {name: state[NAMES.get(name, name)] for name in (each.name for each in fields(RunState))}
     values["budget"] = Budget(**values["budget"])
     values["curve"] = tuple(CurvePoint(**row) for row in values["curve"])
     values["upcoming"] = tuple(values["upcoming"])

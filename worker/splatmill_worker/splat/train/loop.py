@@ -196,10 +196,10 @@ def _result(
         cameras_moved=None if run.poses is None else run.poses.pixels_moved(),
         validation=validation,
         disagreements=disagreements,
-        limited=run.state.limited or started_full(run.plan, run.engine.count),
+        limited=run.state.limited or started_full(run.plan),
     )
 
 
-def started_full(plan: Plan, count: int) -> bool:
-    """Whether no Gaussians were added because there were as many as the plan allows, and not because of an option."""
-    return not plan.densify and "densify" not in plan.forced and count >= plan.max_gaussians
+def started_full(plan: Plan) -> bool:
+    """Whether none are added because training begins with as many Gaussians as are allowed, and not by an option."""
+    return not plan.densify and "densify" not in plan.forced

@@ -162,6 +162,7 @@ class TrainingRun:
         """Restore the best scene, where one was kept: what came after it is over-fitting."""
         if self.best is not None:
             self._restore(self.best)
+            self.state.limited = self.best.state.limited
             self.last_good = self.best
             self.health.expect_rise(self.state.step)
 
@@ -191,6 +192,7 @@ class TrainingRun:
             raise failure
         self.state.recoveries += 1
         if failure.name is FailureName.memory:
+            self.state.limited = True
             self.state.max_gaussians = max(1, int(MEMORY_SHRINK * self.engine.count))
             self.last_good = self.last_good.most_opaque(self.state.max_gaussians)
             self.best = None
