@@ -3,7 +3,7 @@
 Hypothesis draws the same values in every run, whatever else its process has imported. Threads of the kernels sleep
 soon at barriers, as they do in the worker's own processes. Test processes that run side by side divide the cores
 between them. No garbage is looked for while tests are collected. A umask that a command sets in the process of its test
-is taken back.
+is taken back, and so is what a test sets of the log.
 """
 
 import gc
@@ -13,6 +13,7 @@ from pathlib import Path
 from zlib import crc32
 
 import pytest
+import structlog
 from hypothesis import settings
 from hypothesis.internal.conjecture import providers
 
@@ -84,3 +85,10 @@ def _umask() -> Iterator[None]:
     os.umask(before)
     yield
     os.umask(before)
+
+
+@pytest.fixture(autouse=True)
+def _log() -> Iterator[None]:
+    before = structlog.get_config()
+    yield
+    structlog.configure(**before)

@@ -158,9 +158,11 @@ class Bench:
 @contextlib.contextmanager
 def bench() -> Iterator[Bench]:
     """Start the server and its Redis."""
+    before = structlog.get_config()
     structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.CRITICAL))
     logging.getLogger("python_multipart").setLevel(logging.CRITICAL)
     with contextlib.ExitStack() as stack:
+        stack.callback(structlog.configure, **before)
         place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="hostile-")))
         url = stack.enter_context(empty_redis(place / "redis"))
         client: redis.Redis = connect(url)
