@@ -10,7 +10,6 @@ import gc
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from zlib import crc32
 
 import pytest
 import structlog
@@ -42,9 +41,6 @@ def pytest_collection_finish() -> None:
 
 FOLDER = Path(__file__).parent
 
-BROWSER = "browser"
-"""The folder whose tests share a browser."""
-
 LONGEST = (
     "service/test_kills.py",
     "docs/test_blocks.py",
@@ -62,21 +58,10 @@ LONGEST = (
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The longest files first, then those with slow tests, so that no process is left alone with one at the end.
-
-    The others are shuffled, by a hash of their paths: in the order of folders, files that wait for services would run
-    side by side, and later those that compute. Those with a browser follow each other, as they share it.
-    """
+    """The longest files first, then those with slow tests, so that no process is left alone with one at the end."""
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     first = {FOLDER / name: place for place, name in enumerate(LONGEST)}
-
-    def place(path: Path) -> tuple[int, bool, int]:
-        name = path.relative_to(FOLDER)
-        shuffled = crc32((BROWSER if name.parts[0] == BROWSER else name.as_posix()).encode())
-        return first.get(path, len(first)), path not in slow, shuffled
-
-    places = {path: place(path) for path in {item.path for item in items}}
-    items.sort(key=lambda item: places[item.path])
+    items.sort(key=lambda item: (first.get(item.path, len(first)), item.path not in slow))
 
 
 @pytest.fixture(autouse=True)
