@@ -17,6 +17,7 @@ from splatmill_server.space.retention import Ages
 from splatmill_server.space.usage import Usage
 from tests.server.space.conftest import Clock, Person, ServePeople, as_object_store
 from tests.support.served_app import ServedApp, stored
+from tests.support.waiting import wait_for
 
 pytestmark = pytest.mark.slow  # a server for each case
 
@@ -28,7 +29,7 @@ def failed(app: ServedApp, capture: str) -> str:
     app.begin(job_id)
     problem = Problem.of("sfm_failed", "The cameras could not be recovered.")
     app.say(job_id, StateEvent(state=JobState.failed, problem=problem))
-    app.service.jobs.list_active()  # the reaper retires it
+    retire(app, job_id)
     return job_id
 
 
@@ -36,8 +37,14 @@ def succeeded(app: ServedApp, capture: str) -> str:
     job_id = app.job(capture)
     app.begin(job_id)
     app.finish(job_id)
-    app.service.jobs.list_active()
+    retire(app, job_id)
     return job_id
+
+
+def retire(app: ServedApp, job_id: str) -> None:
+    """Let the reaper retire a job that has ended, or another thread that does so already."""
+    app.service.jobs.list_active()
+    wait_for(lambda: not app.service.storage.exists(layout.unfinished_job(job_id)))
 
 
 def sweep(app: ServedApp, days: float = 0.0, **ages: float) -> list[tuple[str, str]]:
