@@ -33,6 +33,7 @@ from splatmill_server.responses.single_file import WEB
 from splatmill_worker.splat.formats import registry
 from tests.support.ball import write_ply
 from tests.support.command_line import invoke
+from tests.support.programs import npm_package
 from tests.support.served_app import Serve, ServedApp, problem
 from tests.support.servers.rendering import hold_out, serve_in, store_only_ball
 from tests.support.servers.scripted_server import Reply, scripted_server
@@ -198,8 +199,7 @@ def test_the_model_with_its_viewer_in_one_file(app: ServedApp) -> None:
 
 
 def test_a_large_model_is_in_the_file_in_levels(app: ServedApp, monkeypatch: pytest.MonkeyPatch) -> None:
-    if not (WEB / "vendor/playcanvas").is_dir():
-        pytest.skip("the file needs PlayCanvas, which npm installs")
+    npm_package("playcanvas")  # it is in the file
     monkeypatch.setattr(single_file, "MANY", 399)  # the model has 400 Gaussians
     answer = app.http.get(f"/v1/models/{MODEL}/download/html")
     assert answer.status_code == 200

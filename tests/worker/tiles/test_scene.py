@@ -143,12 +143,14 @@ def test_a_tile_goes_on_where_the_coarse_model_stopped(whole: Path) -> None:
 
 
 def test_a_tile_adds_gaussians_for_as_long_as_one_piece_or_as_a_limit_stopped_the_coarse_training(
-    whole: Path,
+    whole: Path, tmp_path: Path
 ) -> None:
     path = PlanFolder.open(whole).ended()["coarse"].path
     assert path is not None
     coarse = coarse_model.read(path)
-    assert coarse.limited == (coarse.gaussians.count == coarse.plan.max_gaussians)
+    for limited in (True, False):
+        replace(coarse, limited=limited).write(tmp_path)
+        assert coarse_model.read(tmp_path).limited is limited
     for limited, until in ((True, 0.7 / 0.8), (False, (0.7 - 0.5) / (0.5 * 0.8))):
         growing = tile_plan(replace(coarse, limited=limited), 500, 11)
         assert growing.densify

@@ -163,9 +163,8 @@ def tile_plan(coarse: Coarse, free: int, photos: int, *, last: bool = False) -> 
     scene (decisions: tile-rates).
 
     Gaussians are added up to the share of both trainings at which one piece adds the last: later ones learn what single
-    photos show. In a tile of fewer than some hundred steps, that is before the first are added. Where a limit stopped
-    the coarse training from adding more, they are added up to that share of the tile's own steps (decisions:
-    tile-growth).
+    photos show. A tile of fewer than some hundred steps adds none by then. Where a limit stopped the coarse training
+    from adding more, they are added up to that share of the tile's own steps (decisions: tile-growth).
     """
     plan, schedule = coarse.plan, coarse.plan.schedule
     until, boost = 1.0 - LAST, schedule.annealing.boost
