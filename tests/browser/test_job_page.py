@@ -500,12 +500,19 @@ def test_the_units_of_a_scene_in_tiles_are_counted_by_kind(page: Page) -> None:
         return lines.map((line) => [...line.children].map((cell) => cell.textContent));
     }"""
     page.goto("/glossary")
-    done = [("cameras", 4, None), ("coarse", 8, 500), ("tile-1", 2, 1000), ("tile-7", 4, 2000)]
+    done = [
+        ("photos", 1, None),
+        ("cameras", 4, None),
+        ("coarse", 8, 500),
+        ("tile-1", 2, 1000),
+        ("tile-7", 4, 2000),
+    ]
     events: list[dict[str, Any]] = [{"unit": "tile-1", "state": "running"}]
     events += [{"unit": unit, "state": "done", "seconds": s, "gaussians": n} for unit, s, n in done]
     events += [{"unit": "tile-2", "state": "running"}, {"unit": "tile-9", "state": "failed"}]
     events += [{"unit": f"tile-{number}", "state": "elsewhere"} for number in (3, 4)]
     assert page.evaluate(rows, events) == [
+        ["Photos", "✓", "", "", "1.0 s"],
         ["Cameras", "✓", "", "", "4.0 s"],
         ["Coarse model", "✓", "", "500", "8.0 s"],
         ["Tiles", "2 of 9", "2; 3, 4 on other workers; 9 failed", "3,000", "3.0 s"],
@@ -515,11 +522,19 @@ def test_the_units_of_a_scene_in_tiles_are_counted_by_kind(page: Page) -> None:
     # With its attempt, what was in work has ended.
     state = lambda name: {"type": "state", "state": name}  # noqa: E731
     lost = page.evaluate(rows, [state("training"), *events, state("queued")])
-    assert lost[2] == ["Tiles", "2 of 9", "9 failed", "3,000", "3.0 s"]
+    assert lost[3] == ["Tiles", "2 of 9", "9 failed", "3,000", "3.0 s"]
     many = [{"unit": f"seam-{number}", "state": "elsewhere"} for number in range(1, 8)]
-    assert page.evaluate(rows, [*many, {"unit": "scene", "state": "running"}])[3:] == [
-        ["Last steps of tiles", "0 of 9", "7 tiles on other workers", "", ""],
+    assert page.evaluate(rows, [*many, {"unit": "scene", "state": "running"}])[4:] == [
+        ["Last steps of tiles", "0 of 9", "7 on other workers", "", ""],
         ["Whole scene", "", "yes", "", ""],
+    ]
+    divided = [{"unit": f"features-{number}", "state": "done", "seconds": number} for number in (1, 3)]
+    divided += [{"unit": "features-2", "state": "elsewhere"}, {"unit": "pairs", "state": "running"}]
+    assert page.evaluate(rows, divided)[:4] == [
+        ["Photos", "", "", "", ""],
+        ["Features of photos", "2", "2 on other workers", "", "2.0 s"],
+        ["Pairs of photos", "", "yes", "", ""],
+        ["Cameras", "", "", "", ""],
     ]
 
 

@@ -124,7 +124,7 @@ def in_tiles(plan: PlanFolder, units: dict[str, dict[str, float]]) -> Row:
         **{name: scene[name] for name in ("psnr", "ssim", "gaussians")},
         "trained_steps": scene["steps"],
         "coarse_psnr": facts["coarse"]["psnr"],
-        "cpu": round(sum(use["cpu"] for name, use in units.items() if name != "cameras"), 1),
+        "cpu": round(sum(use["cpu"] for name, use in units.items() if name not in plan.plan.camera_names), 1),
         "chain": round(units["coarse"]["cpu"] + longest + units["scene"]["cpu"], 1),
         "memory": max(units[name]["memory"] for name in ("coarse", *trained)),
         "seam_share": seams.get("share"),
@@ -226,9 +226,9 @@ def draw(rows: list[Row]) -> Figure:
         panel.barh(place + 0.2, one["cpu"], height=0.35, color=_plot.CYCLE[0])
         left = 0.0
         for name, use in row["units"].items():
-            if name == "cameras":
-                continue
             kind = name.partition("-")[0]
+            if kind not in KINDS:
+                continue
             color = _plot.CYCLE[1 + list(KINDS).index(kind)]
             panel.barh(place - 0.2, use["cpu"], left=left, height=0.35, color=color, edgecolor="white")
             left += use["cpu"]

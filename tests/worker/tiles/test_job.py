@@ -25,6 +25,7 @@ from splatmill.schema import (
     TrainOptions,
     UnitEvent,
 )
+from splatmill_worker import synthetic
 from splatmill_worker.pipeline import Outcome
 from splatmill_worker.tiles import job
 from splatmill_worker.tiles.folder import PlanFolder
@@ -107,7 +108,7 @@ def test_units_are_done_in_order_and_stored_and_those_of_others_are_waited_for(t
     assert outcome.ended == "succeeded"
     assert (others.offered, others.stores, others.ended) == (
         ["tile-1", "tile-2", "seam-1", "seam-2"],
-        ["cameras", "coarse", "tile-1", "seam-1", "seam-2"],
+        ["photos", "cameras", "coarse", "tile-1", "seam-1", "seam-2"],
         1,
     )
     assert [event.state for event in events if isinstance(event, StateEvent)] == [
@@ -118,14 +119,16 @@ def test_units_are_done_in_order_and_stored_and_those_of_others_are_waited_for(t
     told = [event for event in events if isinstance(event, UnitEvent)]
     both = ("running", "done")
     assert [(event.unit, event.state) for event in told] == [
-        *((unit, state) for unit in ("cameras", "coarse", "tile-1") for state in both),
+        *((unit, state) for unit in ("photos", "cameras", "coarse", "tile-1") for state in both),
         *(("tile-2", state) for state in ("elsewhere", "done")),
         *((unit, state) for unit in ("seam-1", "seam-2", "scene") for state in both),
     ]
     assert {event.tiles for event in told} == {2}
     for event in told:
         assert (event.seconds is not None) == (event.state == "done")
-        assert (event.gaussians is not None) == (event.state == "done" and event.unit != "cameras")
+        assert (event.gaussians is not None) == (
+            event.state == "done" and event.unit not in ("photos", "cameras")
+        )
     notes = {event.note for event in events if isinstance(event, ProgressEvent)}
     assert "tile 1 of 2" in notes
     assert "seam 2 of 2" in notes
@@ -135,6 +138,41 @@ def test_units_are_done_in_order_and_stored_and_those_of_others_are_waited_for(t
     assert (outcome.out / "model.ply").stat().st_size > 0
     again, events = run(tmp_path, Play())
     assert (again.ended, events) == ("succeeded", [])
+
+
+@pytest.mark.parametrize("failed", [False, True])
+def test_features_and_matches_of_others_are_waited_for_and_used(tmp_path: Path, failed: bool) -> None:
+    """Until the cameras are there. failed: the features that others have, which later units find then."""
+    synthetic.capture(tmp_path / "capture" / "images", 16, 240, 180, samples=1)
+
+    class Has(Play):
+        def gather(self, folder: PlanFolder) -> None:
+            if self.has and f"{self.has[0].partition('-')[0]}-1" in folder.states():
+                with folder.claimed(self.has.pop(0)) as run:
+                    if failed:
+                        run.fail("Its decoder ended.", "")
+                    else:
+                        run_unit(Context(folder, run, lambda event: None, lambda: False))
+
+    others = Has(lambda folder: None, *(("features-2",) if failed else ("features-2", "matches-2")))
+    outcome, events = run(tmp_path, others, lambda events: "cameras" in others.stores)
+    assert outcome.ended == "cancelled"
+    matches = [] if failed else ["matches-1", "matches-2"]  # what failed is not known elsewhere
+    assert others.offered == ["features-1", "features-2", *matches]
+    told = [(event.unit, event.state) for event in events if isinstance(event, UnitEvent)]
+    both, last = ("running", "done"), "running" if failed else "elsewhere"
+    assert told == [
+        *((unit, state) for unit in ("photos", "features-1") for state in both),
+        *(("features-2", state) for state in ("elsewhere", "failed" if failed else "done")),
+        *((unit, state) for unit in ("pairs", "matches-1") for state in both),
+        *(("matches-2", state) for state in (last, "done")),
+        *(("cameras", state) for state in both),
+    ]
+    progress = [event for event in events if isinstance(event, ProgressEvent)]
+    waits = [(event.stage, event.done, event.total) for event in progress if "waiting" in (event.note or "")]
+    assert waits == [(stage, 2, 2) for stage in (("features",) if failed else ("features", "matching"))]
+    assert "features 1 of 2: still_0001.jpg" in {event.note for event in progress}
+    assert sum(event.stage == "images" and event.note == "still_0001.jpg" for event in progress) == 1
 
 
 def test_a_failed_tile_is_said_and_the_scene_is_made_without_it(tmp_path: Path) -> None:
@@ -177,7 +215,7 @@ def test_a_coarse_training_that_was_interrupted_continues(tmp_path: Path) -> Non
 
     others = Play()
     outcome, events = run(tmp_path, others, lambda events: len(measured(events)) >= 3)
-    assert (outcome.ended, others.stores, others.ended) == ("cancelled", ["cameras"], 1)
+    assert (outcome.ended, others.stores, others.ended) == ("cancelled", ["photos", "cameras"], 1)
     before = measured(events)
     outcome, events = run(tmp_path, Play())
     assert outcome.ended == "succeeded"

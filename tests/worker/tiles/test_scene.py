@@ -13,14 +13,18 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from splatmill.schema import Backend, ModelCameras, Report, TrainOptions
-from splatmill_worker import pipeline
+from splatmill_worker import pipeline, synthetic
+from splatmill_worker.colmap import pycolmap
 from splatmill_worker.kernels.gpu.device import absence
 from splatmill_worker.splat.formats import registry
 from splatmill_worker.splat.gaussians import concatenate
@@ -238,7 +242,7 @@ def test_the_bytes_are_the_same_whoever_does_the_units_and_one_of_them_is_killed
     texts = [process.communicate(timeout=600)[0] for process in both]
     assert [process.returncode for process in both] == [0, 0], texts
     assert model_of(root) == model_of(whole)
-    assert len(list(claims.iterdir())) == 7, "nothing but outputs is left"
+    assert len(list(claims.iterdir())) == len(PlanFolder.open(root).plan.units), "nothing but outputs is left"
 
 
 def test_a_unit_that_is_stopped_is_free_and_its_partners_are_kept(whole: Path, tmp_path: Path) -> None:
@@ -274,11 +278,11 @@ def test_another_option_repeats_only_what_depends_on_it_and_other_photos_all(
     whole: Path, tmp_path: Path
 ) -> None:
     root = copied(whole, tmp_path / "plan")
-    assert "done already: cameras\n" in planned(whole / "photos", root, steps=60)
-    assert PlanFolder.open(root).states() == {"cameras": "done"}
-    assert "done already: cameras, coarse, tile-1, tile-2, seam-1, seam-2, scene\n" in planned(
-        whole / "photos", root
-    )
+    assert "done already: photos, cameras\n" in planned(whole / "photos", root, steps=60)
+    again = PlanFolder.open(root)
+    assert again.states() == dict.fromkeys(again.plan.camera_names, "done")
+    kept = "photos, cameras, coarse, tile-1, tile-2, seam-1, seam-2, scene"
+    assert f"done already: {kept}\n" in planned(whole / "photos", root)
     (root / "scene").unlink()
     (root / "scene").symlink_to("units")  # as another plan may have left it
     done("splatmill", "unit", str(root))
@@ -303,7 +307,8 @@ def test_units_are_listed(whole: Path, tmp_path: Path, capsys: pytest.CaptureFix
         assert command.list_units(root, as_json=True) == 0
         rows = {row["unit"]: row for row in json.loads(capsys.readouterr().out)}
     assert {name: row["state"] for name, row in rows.items()} == {
-        "cameras": "done", "coarse": "done", "tile-1": "running", "tile-2": "done",
+        **dict.fromkeys(("features-1", "features-2", "pairs", "matches-1", "matches-2"), "left out"),
+        "photos": "done", "cameras": "done", "coarse": "done", "tile-1": "running", "tile-2": "done",
         "seam-1": "waiting", "seam-2": "waiting", "scene": "waiting",
     }  # fmt: skip
     assert rows["tile-1"]["why"] == f"{os.uname().nodename}, process {os.getpid()}"
@@ -313,7 +318,7 @@ def test_units_are_listed(whole: Path, tmp_path: Path, capsys: pytest.CaptureFix
     assert command.do_units(root, ["scene"]) == command.REFUSED
     assert "scene needs tile-1, seam-1, seam-2 first" in capsys.readouterr().err
     assert command.do_units(root, ["tile-9"]) == command.REFUSED
-    assert "Its units are cameras, coarse, tile-1" in capsys.readouterr().err
+    assert "Its units are photos, features-1" in capsys.readouterr().err
 
 
 def test_a_capture_without_cameras_fails_once_and_says_why(tmp_path: Path) -> None:
@@ -325,6 +330,34 @@ def test_a_capture_without_cameras_fails_once_and_says_why(tmp_path: Path) -> No
     assert process.returncode == command.FAILED
     assert "cameras    failed" in text
     assert "coarse     waiting   needs cameras" in text
+
+
+def test_masks_that_were_made_of_photos_are_read_by_later_units(tmp_path: Path) -> None:
+    """With a logo in each photo, whose mask lies in the output of the first unit, which decoders must be let read."""
+    root, capture = tmp_path / "plan", tmp_path / "capture"
+    synthetic.capture(capture / "images", 16, 320, 240, samples=1)
+    logo = np.random.default_rng(0).integers(0, 2, (3, 24)).repeat(6, 0).repeat(6, 1)
+    for path in sorted((capture / "images").iterdir()):
+        pixels = np.asarray(Image.open(path)).copy()
+        pixels[8:26, 10:154][logo == 1] = 250
+        Image.fromarray(pixels).save(path, quality=95)
+    assert command.make_plan(root, capture, OPTIONS.model_dump_json()) == 0
+    for unit in ("photos", "features-1"):
+        assert command.do_units(root, [unit]) == 0
+    outputs = {name: ended.path for name, ended in PlanFolder.open(root).ended().items()}
+    assert list(outputs) == ["photos", "features-1"]
+    photos, features = outputs["photos"], outputs["features-1"]
+    assert photos is not None
+    assert features is not None
+    assert list((photos / "overlays").iterdir())
+    (path,) = features.rglob("database.db")
+    with closing(pycolmap.Database.open(path)) as database:
+        points = np.concatenate(
+            [database.read_keypoints(image.image_id) for image in database.read_all_images()]
+        )
+    on_logo = (points[:, 0] > 12) & (points[:, 0] < 150) & (points[:, 1] > 10) & (points[:, 1] < 24)
+    assert len(points) > 300
+    assert not on_logo.any()
 
 
 def test_a_unit_that_ends_its_process_is_given_up_and_the_others_are_not(
@@ -360,7 +393,8 @@ for name in names:
         unit.name: "failed" if unit.name == "tile-2" else "done" for unit in PlanFolder.open(root).plan.units
     }
     assert (root / "log").read_text().split() == [
-        *("cameras", "coarse", "tile-1", "tile-2", "tile-2", "tile-2", "seam-1", "seam-2", "scene"),
+        *("photos", "features-1", "features-2", "pairs", "matches-1", "matches-2", "cameras", "coarse"),
+        *("tile-1", "tile-2", "tile-2", "tile-2", "seam-1", "seam-2", "scene"),
     ]
     assert "tile-2 was tried 3 times, and its process was killed" in capsys.readouterr().out
 
@@ -394,7 +428,8 @@ def test_an_attempt_that_another_machine_may_do_is_no_failure(
     asked = OPTIONS.model_copy(update={"backend": Backend.gpu})
     capture = still_life.posed_capture(tmp_path / "capture")
     assert command.make_plan(tmp_path, capture, asked.model_dump_json()) == 0
-    assert command.do_units(tmp_path, ["cameras"]) == 0
+    for unit in PlanFolder.open(tmp_path).plan.camera_names:
+        assert command.do_units(tmp_path, [unit]) == 0
     lacking = absence() is not None
     assert command.do_units(tmp_path, ["coarse"]) == (command.BROKEN if lacking else 0)
     assert ("gpu" in capsys.readouterr().err) == lacking

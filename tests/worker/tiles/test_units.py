@@ -27,10 +27,7 @@ def test_a_walk_in_any_order_ends_with_the_scene_unless_what_it_needs_failed(see
             assert all(need in states for need in unit.needs)
         name = choose.choice(ready)
         states[name] = "failed" if choose.random() < 0.15 else "done"
-        assert all(need in scene.before(name) for need in scene.unit(name).needs)
-    assert scene.before("tile-1") == {"cameras", "coarse"}
-    assert scene.before("scene") == {unit.name for unit in scene.units} - {"scene"}
-    if states["cameras"] == "done" and states.get("coarse") == "done":
+    if all(states.get(name) == "done" for name in ("photos", "pairs", "cameras", "coarse")):
         assert set(states) == {unit.name for unit in scene.units}
     else:
         assert "scene" not in states
@@ -45,8 +42,9 @@ def test_only_what_depends_on_an_option_has_another_key() -> None:
         return {name for name in names if plan().key(name, {}) != other.key(name, {})}
 
     assert changed(plan()) == set()
-    assert changed(plan(steps=500)) == set(names) - {"cameras"}
-    assert changed(plan(tiles=5)) == set(names) - {"cameras"}
+    assert changed(plan(steps=500)) == set(names) - set(plan().camera_names)
+    assert changed(plan(tiles=5)) == set(names) - {"photos", "pairs", "cameras"}
+    assert changed(plan(mapper="global")) == set(names) - set(plan().camera_names[:-1])
     assert changed(plan(sfm_effort="high")) == set(names)
     assert changed(plan(digest="e")) == set(names)
     keys = [plan().key(name, {}) for name in names]
@@ -59,6 +57,19 @@ def test_a_scene_without_a_failed_tile_is_another_output() -> None:
     assert plan().key("scene", {"tile-1": "done"}) == whole
     assert plan().key("scene", {"seam-1": "failed"}) != whole
     assert plan().key("seam-3", {"tile-1": "failed"}) != plan().key("seam-3", {})
+
+
+def test_what_only_the_cameras_need_is_not_done_once_they_are_there() -> None:
+    scene = plan(2)
+    assert scene.ready({"cameras": "done"}) == ["photos"]
+    assert scene.ready({"cameras": "done", "photos": "done"}) == ["coarse"]
+    assert scene.ready({"photos": "done"}) == ["features-1", "features-2"]
+    assert scene.wanted(dict.fromkeys(("cameras", "coarse"), "done")) == {
+        *("photos", "tile-1", "tile-2", "seam-1", "seam-2", "scene")
+    }
+    failed: dict[str, State] = {"photos": "done", "features-1": "failed", "features-2": "done"}
+    assert scene.ready(failed) == ["pairs"]
+    assert scene.key("cameras", failed) == scene.key("cameras", {})
 
 
 def test_options_that_cameras_follow_from_exist_and_a_plan_survives_json() -> None:

@@ -31,15 +31,23 @@ import _plot
 import numpy as np
 from _page import Column
 from _rows import Row, distinct, footer, of
+from _schedule import makespan
 from _studies.study import Study
 from matplotlib.figure import Figure
 from sfm import aligned
 
 from ground.commands import Usage, run
+from splatmill.schema import TrainOptions
 from splatmill_worker.colmap import pycolmap
+from splatmill_worker.tiles.units import ScenePlan
 
 SPLATMILL = [sys.executable, "-m", "splatmill"]
 WAYS = ("in one piece", "in tiles")
+MACHINES = (2, 4, 8)
+"""Numbers of machines for which the time is worked out."""
+
+KINDS = {"features": "features", "matches": "matches", "tile": "tiles", "seam": "seams"}
+"""Kinds of units of which there are several, and what several are called."""
 PHOTOS_PER_TILE = 30
 """Photos for each of which so many a scene gets one more tile, where --tiles does not say."""
 
@@ -164,10 +172,10 @@ def stages(rows: list[Row]) -> str:
     lines = []
     for row in rows:
         parts = dict(row.get("stages", {}))
-        for kind in ("tile", "seam"):
+        for kind, plural in KINDS.items():
             times = [parts.pop(name) for name in list(parts) if name.startswith(f"{kind}-")]
             if times:
-                parts[f"{len(times)} {kind}s"] = round(sum(times), 1)
+                parts[f"{len(times)} {plural}"] = round(sum(times), 1)
         text = ", ".join(f"{name} {seconds:.0f}" for name, seconds in parts.items() if seconds >= 0.5)
         memory, silence = (
             f"`{row[name][:70]}`" if row.get(name) else "" for name in ("memory_after", "silence_after")
@@ -177,6 +185,34 @@ def stages(rows: list[Row]) -> str:
         "photos:|way|wall seconds of its stages|line before the most memory|line before the longest silence",
         lines,
     )
+
+
+def machines(rows: list[Row]) -> str:
+    """How long the units of each scene in tiles take on several machines, and on one."""
+    lines = []
+    for row in of(rows, way=WAYS[1]):
+        units = row.get("stages", {})
+        if "failed" in row or "photos" not in units:
+            continue  # of a plan whose cameras were one unit
+        plan = ScenePlan("", TrainOptions(tiles=row["tiles"]))
+        one = makespan(plan, units, 1)
+        parts = {
+            name: sum(seconds for unit, seconds in units.items() if unit in members)
+            for name, members in (
+                ("cameras", plan.camera_names),
+                ("coarse", ("coarse",)),
+                ("tiles", plan.tile_names + plan.seam_names),
+                ("scene", ("scene",)),
+            )
+        }
+        times = [f"{makespan(plan, units, count):.0f} s" for count in MACHINES]
+        share = makespan(plan, units, 4) / one
+        spent = [f"{each:.0f} s" for each in (*parts.values(), one)]
+        lines.append([row["photos"], row["tiles"], *spent, *times, f"{share:.2f}"])
+    if not lines:
+        return ""
+    head = "photos:|tiles:|cameras:|coarse model:|tiles:|scene:|all in turn:"
+    return _page.table(f"{head}|{'|'.join(f'{count} machines:' for count in MACHINES)}|4 to 1:", lines)
 
 
 def exponent(rows: list[Row], name: str) -> float | None:
@@ -248,7 +284,14 @@ STUDY = Study(
     cases={"photos": measured},
     key=("photos", "way", "visits", "image_size", "max_memory", "seed"),
     order=lambda row: (row["photos"], WAYS.index(row["way"])),
-    blocks={"growth": growth, "table": table, "stages": stages, "generator": generator, "footer": made},
+    blocks={
+        "growth": growth,
+        "table": table,
+        "stages": stages,
+        "machines": machines,
+        "generator": generator,
+        "footer": made,
+    },
     figures={"ground": draw},
     home=Path(__file__).resolve().parent,
     options={

@@ -56,6 +56,7 @@ class UsablePhoto:
     exif: the tags that structure from motion uses.
     mask: path of the mask, if there is one.
     shown_from: level of the mask, 0 to 255, from which a pixel is shown.
+    mask_sha256: of the mask's content, where it was read before; None: not known.
     sequence: name of the video that the photo is a frame of, if it is one.
     several: whether the file holds further pictures, which are not used.
     colors: how its colours become sRGB, as `PhotoColors.remark` says it.
@@ -74,6 +75,7 @@ class UsablePhoto:
     exif: exif.Exif
     mask: Path | None = None
     shown_from: int = MIN_SHOWN
+    mask_sha256: str | None = None
     sequence: str | None = None
     several: bool = False
     colors: str = ""
@@ -82,6 +84,10 @@ class UsablePhoto:
     circle: Circle | None = None
     alpha: transparency.Extent = (255, 255)
     kind: no_photo.Kind = ""
+
+    def hash_of_mask(self) -> str | None:
+        """The SHA-256 of the mask's content; None without a mask."""
+        return self.mask_sha256 if self.mask is None or self.mask_sha256 is not None else _sha256(self.mask)
 
 
 @dataclass(frozen=True)
@@ -106,7 +112,7 @@ class Prepared:
         """A hash of the names and contents of all photos and masks."""
         digest = hashlib.sha256()
         for photo in self.photos:
-            mask = f"{_sha256(photo.mask)}{photo.shown_from}" if photo.mask is not None else ""
+            mask = "" if photo.mask is None else f"{photo.hash_of_mask()}{photo.shown_from}"
             kind = "\0panorama" if photo.is_panorama else ""
             digest.update(f"{photo.name}\0{photo.sha256}\0{mask}{kind}\n".encode())
         return digest.hexdigest()

@@ -41,7 +41,13 @@ def recover_cameras(job: Job, stages: Stages) -> Cameras:
     live = None if job.looks is None else LiveCameras(job.looks, job.emit, job.workdir)
     with stages.measured("sfm"):
         scene = posed_scene(
-            job.capture, job.workdir, job.options, progress_events(job.emit), job.cancelled, live
+            job.capture,
+            job.workdir,
+            job.options,
+            progress_events(job.emit),
+            job.cancelled,
+            live,
+            job.prepared,
         )
     if job.looks is not None and job.looks.seconds:
         stages.add("sfm", -job.looks.seconds)

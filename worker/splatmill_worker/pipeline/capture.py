@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from splatmill.data_sets import TwoDataSets
@@ -13,7 +13,7 @@ from splatmill_worker.errors import Refusal
 from splatmill_worker.images.masks import mask_folder
 from splatmill_worker.images.overlays import overlays
 from splatmill_worker.images.panoramas import faces
-from splatmill_worker.images.prepare import names_remark
+from splatmill_worker.images.prepare import Prepared, names_remark, prepare
 from splatmill_worker.pipeline import example, given_points, one_place
 from splatmill_worker.scene import Scene
 from splatmill_worker.sfm import posed
@@ -28,6 +28,62 @@ CAMERAS_SHARE = 0.5
 """Share of the time of a whole job after which no other way to place more photos is tried."""
 
 
+@dataclass(frozen=True)
+class _Found:
+    """What a capture holds.
+
+    capture: folder with images/, or with photos; that of the unpacked data set where the capture is a zip of one.
+    points: file of points to start from.
+    given: the cameras that it brings; None where they are to be recovered.
+    """
+
+    capture: Path
+    points: Path | None
+    given: posed.PosedInput | None
+
+    @property
+    def photos(self) -> Path:
+        """The folder of the photos without cameras."""
+        images = self.capture / "images"
+        return images if images.is_dir() else self.capture
+
+
+def photos_without_cameras(
+    capture: Path,
+    workdir: Path,
+    options: TrainOptions,
+    on_progress: OnProgress,
+    cancelled: Callable[[], bool],
+) -> Prepared | None:
+    """The photos whose cameras `posed_scene` recovers; None where the capture brings cameras.
+
+    Raises Refusal, as `posed_scene` does, and what `prepare` raises.
+    """
+    found = _found(capture, workdir, options, on_progress, cancelled)
+    if found.given is not None:
+        return None
+    return prepare(
+        found.photos,
+        mask_folder(found.capture),
+        workdir,
+        frames=options.max_video_frames,
+        on_progress=on_progress,
+        cancelled=cancelled,
+    )
+
+
+def sfm_options(options: TrainOptions) -> sfm.SfmOptions:
+    """Those of structure from motion."""
+    return sfm.SfmOptions(
+        effort=options.sfm_effort.value,
+        matcher=options.matcher.value,
+        mapper=options.mapper.value,
+        frames=options.max_video_frames,
+        seed=options.seed,
+        seconds=None if options.within is None else CAMERAS_SHARE * options.within,
+    )
+
+
 def posed_scene(
     capture: Path,
     workdir: Path,
@@ -35,6 +91,7 @@ def posed_scene(
     on_progress: OnProgress,
     cancelled: Callable[[], bool],
     observer: PlacingObserver | None = None,
+    prepared: Prepared | None = None,
 ) -> Scene:
     """Return the scene with the cameras that the capture brings, or else with cameras recovered from the photos.
 
@@ -46,18 +103,12 @@ def posed_scene(
     on_progress: called with the progress of structure from motion, triangulation and stereo.
     cancelled: polled; when it returns true, Cancelled is raised.
     observer: looks at the cameras and points while structure from motion places them.
+    prepared: the photos, where `photos_without_cameras` has found them before.
 
     Raises Refusal for poses and points that cannot be used and for a scale that cannot be followed, and SfmFailed.
     """
-    capture = example.photographed_capture(capture, workdir, on_progress, cancelled)
-    points = given_points.points_path(capture, options)
-    capture = zipped.data_set(capture, workdir, cancelled)
-    try:
-        given = posed.find(capture) or zipped.cameras_beside(capture, workdir, cancelled)
-    except (TwoDataSets, posed.TwoFiles) as error:
-        raise Refusal(
-            "poses_invalid", str(error), advice="Give one data set, or photos without cameras."
-        ) from error
+    found = _found(capture, workdir, options, on_progress, cancelled)
+    capture, points, given = found.capture, found.points, found.given
     if given is not None:
         if options.scale is not None:
             raise Refusal(
@@ -88,24 +139,16 @@ def posed_scene(
         if points is not None:
             scene = given_points.with_given_points(scene, points, options, on_progress, cancelled)
         return replace(scene, warnings=(*scene.warnings, *one_place.warning(scene)))
-    images = capture / "images"
-    wanted = sfm.SfmOptions(
-        effort=options.sfm_effort.value,
-        matcher=options.matcher.value,
-        mapper=options.mapper.value,
-        frames=options.max_video_frames,
-        seed=options.seed,
-        seconds=None if options.within is None else CAMERAS_SHARE * options.within,
-    )
     scene = sfm.reconstruct(
-        images if images.is_dir() else capture,
+        found.photos,
         mask_folder(capture),
         workdir,
-        wanted,
+        sfm_options(options),
         on_progress,
         cancelled,
         observer,
         None if options.scale is None else known_distance(options.scale),
+        prepared,
     )
     if points is not None:
         scene = given_points.with_given_points(scene, points, options, on_progress, cancelled)
@@ -113,3 +156,23 @@ def posed_scene(
     return replace(
         scene, warnings=(*names_remark(capture), *unread, *scene.warnings, *one_place.warning(scene))
     )
+
+
+def _found(
+    capture: Path,
+    workdir: Path,
+    options: TrainOptions,
+    on_progress: OnProgress,
+    cancelled: Callable[[], bool],
+) -> _Found:
+    """What the capture holds. Raises Refusal where it has the cameras of two data sets."""
+    capture = example.photographed_capture(capture, workdir, on_progress, cancelled)
+    points = given_points.points_path(capture, options)
+    capture = zipped.data_set(capture, workdir, cancelled)
+    try:
+        given = posed.find(capture) or zipped.cameras_beside(capture, workdir, cancelled)
+    except (TwoDataSets, posed.TwoFiles) as error:
+        raise Refusal(
+            "poses_invalid", str(error), advice="Give one data set, or photos without cameras."
+        ) from error
+    return _Found(capture, points, given)

@@ -10,6 +10,7 @@ import torch
 
 from splatmill.schema import Backend, LogEvent, Switch, TrainOptions
 from splatmill_worker.errors import Refusal
+from splatmill_worker.images.prepare import Prepared
 from splatmill_worker.kernels.gpu.device import absence
 from splatmill_worker.pipeline.events import Emit
 from splatmill_worker.pipeline.live import Looks
@@ -23,6 +24,7 @@ class Job:
 
     kernels: the backend of the engine.
     looks: those of the onlookers; None where there are none.
+    prepared: the photos as they were examined before; None: they are examined when their cameras are recovered.
     """
 
     capture: Path
@@ -32,6 +34,7 @@ class Job:
     emit: Emit
     cancelled: Callable[[], bool]
     looks: Looks | None
+    prepared: Prepared | None = None
 
     @property
     def keeps_time_lapse(self) -> bool:

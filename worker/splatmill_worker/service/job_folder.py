@@ -13,7 +13,7 @@ import itertools
 import os
 import shutil
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -70,15 +70,21 @@ class JobFolder:
         path = work_folder(self.job_id)
         return path, _locked_folder(path)
 
-    def stage_capture(self, report: Report = lambda done, total: None) -> int:
+    def stage_capture(
+        self, report: Report = lambda done, total: None, only: Collection[str] | None = None
+    ) -> int:
         """Make the capture folder equal to the stored capture; return the number of its files.
+
+        only: names of the files that are wanted; None: all.
 
         Raises CaptureIncomplete when a stored file is not in the folder afterwards, and as `staging.stage`, which calls
         `report`.
         """
         prefix = layout.capture_files(self.capture_id)
         entries = {
-            self.capture / entry.path[len(prefix) + 1 :]: entry for entry in self.storage.entries(prefix)
+            self.capture / name: entry
+            for entry in self.storage.entries(prefix)
+            if (name := entry.path[len(prefix) + 1 :]) and (only is None or name in only)
         }
         for path in self.capture.rglob("*") if self.capture.is_dir() else ():
             if not path.is_dir() and path not in entries:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Collection
+from contextlib import closing
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -20,6 +23,9 @@ from splatmill_worker.sfm.trials import best_mapping, extended_mapping, register
 
 CONNECTING_ROUNDS = 2
 """Largest number of times that more pairs are matched to connect the components of the view graph."""
+
+SCORES = "scores.npz"
+"""File beside a database with the scores of candidate pairs that another process has found by its features."""
 
 RETRY_PARTNERS = 4
 """Likely partners of each photo without a reliable pose whose features are found anew, together with its own."""
@@ -38,37 +44,16 @@ def solve_at(run: SfmRun, effort: Effort, earlier: EffortResult | None) -> Effor
     retried = None
     if earlier is not None and run.reduced_side(earlier.effort) == run.reduced_side(effort):
         retried = _retried(run, earlier)
-    key = digest(
-        VERSION,
-        OPENCV_VERSION,
-        effort,
-        run.options.matcher,
-        run.options.seed,
-        run.camera_model,
-        [(group.photos, group.focal, group.center, group.is_fisheye) for group in run.groups],
-        sorted(retried or ()),
-    )
-    result = EffortResult(effort, run.folder / f"{effort.name}-{key}" / "database.db")
-    with run.clock("features"):
-        if earlier is not None and retried is not None:
+    result = EffortResult(effort, database_of(run, effort, retried))
+    if earlier is not None and retried is not None:
+        with run.clock("features"):
             features.carry_over(earlier.database, result.database, retried)
-        features.extract(
-            run.prepared.photos,
-            run.groups,
-            effort,
-            run.camera_model,
-            result.database,
-            run.pool,
-            run.on_progress,
-            run.cancelled,
-        )
+    find_features(run, result)
     database = pycolmap.Database.open(result.database)
     try:
-        with run.clock("features"):
-            result.ids, result.features = features.load(database)
         if effort.name != LEAN.name:  # a higher effort may find more
             require_features(run, result)
-        _match(run, result, _select_pairs(run, result), database)
+        match(run, result, select_pairs(run, result), database)
         _connect(run, result, database)
         if not result.verified:
             return result
@@ -83,6 +68,44 @@ def solve_at(run: SfmRun, effort: Effort, earlier: EffortResult | None) -> Effor
     finally:
         database.close()
     return result
+
+
+def database_of(run: SfmRun, effort: Effort, retried: set[int] | None = None) -> Path:
+    """Where an effort keeps features and matches. retried: photos whose features it finds anew, of an earlier one."""
+    key = digest(
+        VERSION,
+        OPENCV_VERSION,
+        effort,
+        run.options.matcher,
+        run.options.seed,
+        run.camera_model,
+        [(group.photos, group.focal, group.center, group.is_fisheye) for group in run.groups],
+        sorted(retried or ()),
+    )
+    return run.folder / f"{effort.name}-{key}" / "database.db"
+
+
+def find_features(run: SfmRun, result: EffortResult, only: Collection[int] | None = None) -> None:
+    """Find the features of the photos, or of those with the indices `only`, that the database of the effort lacks, and
+    let the result have them."""
+    groups = run.groups
+    if only is not None:  # the number of a camera is its place among all of them
+        groups = [
+            replace(group, photos=tuple(index for index in group.photos if index in only)) for group in groups
+        ]
+    with run.clock("features"):
+        features.extract(
+            run.prepared.photos,
+            groups,
+            result.effort,
+            run.camera_model,
+            result.database,
+            run.pool,
+            run.on_progress,
+            run.cancelled,
+        )
+        with closing(pycolmap.Database.open(result.database)) as database:
+            result.ids, result.features = features.load(database, only)
 
 
 def _without(mapped: mapper.Mapped | None, retried: set[int]) -> mapper.Mapped | None:
@@ -145,7 +168,7 @@ def require_features(run: SfmRun, result: EffortResult) -> None:
         )
 
 
-def _select_pairs(run: SfmRun, result: EffortResult) -> set[pairs.Pair]:
+def select_pairs(run: SfmRun, result: EffortResult) -> set[pairs.Pair]:
     """The pairs to match in full, by the options, the order of the photos, GPS and preemptive matching."""
     photos, partners = run.prepared.photos, result.effort.partners
     matcher = run.options.matcher
@@ -172,6 +195,8 @@ def _select_pairs(run: SfmRun, result: EffortResult) -> set[pairs.Pair]:
         likely |= pairs.spatial(positions, partners if matcher == "spatial" else partners // 2)
     with run.clock("pairs"):
         if not run.scores:
+            run.scores = _stored_scores(result)
+        if not run.scores:
             run.scores = pairs.preemptive_matches(
                 result.features,
                 likely,
@@ -186,7 +211,17 @@ def _select_pairs(run: SfmRun, result: EffortResult) -> set[pairs.Pair]:
     )
 
 
-def _match(run: SfmRun, result: EffortResult, chosen: set[pairs.Pair], database: pycolmap.Database) -> None:
+def _stored_scores(result: EffortResult) -> dict[pairs.Pair, int]:
+    """The scores of the candidate pairs that another process has left; empty without them."""
+    path = result.database.with_name(SCORES)
+    if not path.is_file():
+        return {}
+    with np.load(path) as stored:
+        rows = stored["scores"].tolist()
+    return {(first, second): score for first, second, score in rows}
+
+
+def match(run: SfmRun, result: EffortResult, chosen: set[pairs.Pair], database: pycolmap.Database) -> None:
     """Match the `chosen` pairs and add their outcomes to the result."""
     total = len(result.matched) + len(chosen)
     before = len(result.matched)
@@ -212,7 +247,7 @@ def _connect(run: SfmRun, result: EffortResult, database: pycolmap.Database) -> 
         more = pairs.connecting_pairs(components, run.scores, set(result.matched), result.effort.partners)
         if not more:
             return
-        _match(run, result, more, database)
+        match(run, result, more, database)
 
 
 def _unregistered(run: SfmRun, result: EffortResult) -> list[int]:
@@ -231,5 +266,5 @@ def _match_unregistered(
     if not more:
         return False
     before = len(result.verified)
-    _match(run, result, more, database)
+    match(run, result, more, database)
     return len(result.verified) > before

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sqlite3
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
@@ -29,6 +29,12 @@ from splatmill_worker.sfm.sift import Features, find, search_slots
 
 MAX_IMAGES = 2147483647
 """COLMAP's kMaxNumImages: it numbers the pair of images a < b as MAX_IMAGES * a + b."""
+
+
+FEATURES = "keypoints", "descriptors"
+"""Tables of COLMAP's database with the features of the photos."""
+
+NO_FEATURES = Features(np.empty((0, 2)), np.empty(0, np.float32), np.empty((0, 128), np.uint8))
 
 
 def reduced_name(group: int, photo: int) -> str:
@@ -124,11 +130,69 @@ def copy_without_pairs(source: Path, target: Path, left_out: Iterable[tuple[int,
         new.commit()
 
 
-def load(database: pycolmap.Database) -> tuple[dict[int, int], list[Features]]:
-    """COLMAP's image id of each photo, and the photos' features in order of their indices."""
+def photos_in(path: Path, *, with_features: bool) -> set[int]:
+    """Indices of the photos in COLMAP's database at `path`: of all, or of those with features."""
+    found = "images JOIN descriptors USING (image_id)" if with_features else "images"
+    with closing(_read_only(path)) as database:
+        return {photo_index(name) for (name,) in database.execute(f"SELECT name FROM {found}")}
+
+
+def completed(path: Path, features_of: Collection[int]) -> None:
+    """Make COLMAP's database at `path` a file by itself, which any number of machines read at a time.
+
+    features_of: indices of the photos whose features it keeps.
+    """
+    with closing(sqlite3.connect(path, isolation_level=None)) as database:
+        images = database.execute("SELECT image_id, name FROM images").fetchall()
+        dropped = [(number,) for number, name in images if photo_index(name) not in features_of]
+        for table in FEATURES:
+            database.executemany(f"DELETE FROM {table} WHERE image_id = ?", dropped)
+        # COLMAP's journal is a second file, which machines that share a folder cannot share.
+        database.execute("PRAGMA journal_mode = DELETE")
+        if dropped:
+            database.execute("VACUUM")
+
+
+def _read_only(path: Path) -> sqlite3.Connection:
+    """A connection that writes no file beside the database, which does not change."""
+    return sqlite3.connect(f"{path.resolve().as_uri()}?immutable=1", uri=True)
+
+
+def merge_databases(source: Path, target: Path, *, without: Iterable[str] = ()) -> None:
+    """Add to COLMAP's database `target` what `source` has beyond it, which nobody writes any more (`completed`). Both
+    number cameras and photos alike.
+
+    without: tables that are left as they are.
+    """
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with closing(_read_only(source)) as old, closing(sqlite3.connect(target)) as new:
+        if not new.execute("SELECT name FROM sqlite_master").fetchone():
+            old.backup(new)
+            for table in without:
+                new.execute(f"DELETE FROM {table}")
+            new.commit()
+            return
+        tables = [name for (name,) in old.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
+        for table in set(tables) - {"sqlite_sequence", *without}:  # the first is SQLite's own
+            rows = old.execute(f"SELECT * FROM {table}")
+            places = ",".join("?" * len(rows.description))
+            new.executemany(f"INSERT OR IGNORE INTO {table} VALUES ({places})", rows)
+        new.commit()
+
+
+def load(
+    database: pycolmap.Database, only: Collection[int] | None = None
+) -> tuple[dict[int, int], list[Features]]:
+    """COLMAP's image id of each photo, and the photos' features in order of their indices.
+
+    only: indices of the photos that features are read of; the others have none. None: all.
+    """
     ids = {photo_index(image.name): image.image_id for image in database.read_all_images()}
     found = []
     for index in sorted(ids):
+        if only is not None and index not in only:
+            found.append(NO_FEATURES)
+            continue
         keypoints = np.asarray(database.read_keypoints(ids[index]), np.float32)
         descriptors = np.asarray(database.read_descriptors(ids[index]).data, np.uint8)
         found.append(Features(keypoints[:, :2].astype(np.float64), keypoints[:, 2], descriptors))

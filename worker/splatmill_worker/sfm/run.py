@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -14,6 +15,7 @@ import torch
 
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.images.prepare import Prepared
+from splatmill_worker.sfm import cameras
 from splatmill_worker.sfm.callbacks import OnProgress
 from splatmill_worker.sfm.cameras import CameraGroup
 from splatmill_worker.sfm.mapping import mapper
@@ -25,6 +27,9 @@ from splatmill_worker.sfm.sift import Features
 
 VERSION = 10
 """Version of everything that is cached; a cache with another version is not read."""
+
+SFM = "sfm"
+"""Folder in a work folder of what structure from motion finds."""
 
 UNFOLDED = "unfolded.db"
 """Name of COLMAP's database without the pairs that show things which look alike."""
@@ -131,6 +136,29 @@ class SfmRun:
             yield
         finally:
             self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - started
+
+
+def folder_of(prepared: Prepared, workdir: Path) -> Path:
+    """Where what structure from motion finds in these photos is kept."""
+    return workdir / SFM / prepared.key[:24]
+
+
+@contextmanager
+def opened(
+    prepared: Prepared,
+    workdir: Path,
+    options: SfmOptions,
+    on_progress: OnProgress,
+    cancelled: Callable[[], bool],
+) -> Iterator[SfmRun]:
+    """A run on these photos, whose threads end with the context."""
+    threads = options.threads or os.cpu_count() or 1
+    groups = cameras.group(prepared.photos)
+    model = options.camera_model if options.camera_model != "auto" else "SIMPLE_RADIAL"
+    # Several pairs are matched at the same time, so that each torch call gets one thread.
+    with ThreadPoolExecutor(threads) as pool, torch_threads(1):
+        folder = folder_of(prepared, workdir)
+        yield SfmRun(prepared, groups, model, options, folder, threads, pool, on_progress, cancelled)
 
 
 @contextmanager

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import logging
-import os
 import shutil
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,7 +31,7 @@ from splatmill_worker.sfm.options import (
     SfmOptions,
 )
 from splatmill_worker.sfm.placed import PlacingObserver
-from splatmill_worker.sfm.run import VERSION, EffortResult, SfmRun, digest, torch_threads
+from splatmill_worker.sfm.run import VERSION, EffortResult, SfmRun, digest, folder_of, opened
 from splatmill_worker.sfm.trials import registered_counts
 from splatmill_worker.sfm.unfold import unfold
 from splatmill_worker.sfm.world.frame import require_photos
@@ -56,6 +54,7 @@ def reconstruct(
     cancelled: Callable[[], bool],
     observer: PlacingObserver | None = None,
     known: KnownDistance | None = None,
+    prepared: Prepared | None = None,
 ) -> Scene:
     """Recover the cameras of the photos under `images`, and of those in its videos and zips.
 
@@ -67,13 +66,15 @@ def reconstruct(
         mapper, a bundle adjustment and the search of a photo for features, ten seconds for a panorama, finish first.
     observer: called with the cameras and points while the incremental mapper places them.
     known: a distance between two photos, which makes the metre the unit of the scene.
+    prepared: the photos as `images.prepare` has examined them before; None: they are examined first.
 
     Raises SfmFailed with facts and advice when no usable model is found, Refusal for a distance between photos that
     are not there, that have no camera, or that are at one place, and Cancelled.
     """
-    prepared = prepare(
-        images, masks, workdir, frames=options.frames, on_progress=on_progress, cancelled=cancelled
-    )
+    if prepared is None:
+        prepared = prepare(
+            images, masks, workdir, frames=options.frames, on_progress=on_progress, cancelled=cancelled
+        )
     try:
         return reconstruct_photos(prepared, workdir, options, on_progress, cancelled, observer, known)
     except SfmFailed as error:
@@ -97,9 +98,7 @@ def reconstruct_photos(
     _require_photos(prepared)
     require_photos(known, [photo.name for photo in prepared.photos])
     stop_if(cancelled)
-    folder = workdir / "sfm" / prepared.key[:24]
-    versions = VERSION, stereo.VERSION, pycolmap.__version__, OPENCV_VERSION
-    whole = folder / f"model-{digest(*versions, options)}"
+    whole = _model_folder(prepared, workdir, options)
     hurried = whole.with_name(f"{whole.name}-hurried")
     for stored in [whole] if options.seconds is None else [whole, hurried]:
         if not is_stored(stored):
@@ -111,12 +110,7 @@ def reconstruct_photos(
                 "The stored cameras are not readable and are recovered anew: %s: %s", stored.name, error
             )
             shutil.rmtree(stored)
-    threads = options.threads or os.cpu_count() or 1
-    groups = cameras.group(prepared.photos)
-    model = options.camera_model if options.camera_model != "auto" else "SIMPLE_RADIAL"
-    # Several pairs are matched at the same time, so that each torch call gets one thread.
-    with ThreadPoolExecutor(threads) as pool, torch_threads(1):
-        run = SfmRun(prepared, groups, model, options, folder, threads, pool, on_progress, cancelled)
+    with opened(prepared, workdir, options, on_progress, cancelled) as run:
         run.observer = observer
         solved = _solve(run)
         run.notes += cameras.fisheye_note(run.groups)
@@ -124,6 +118,16 @@ def reconstruct_photos(
         stored = hurried if run.hurried else whole
         store_model(run, final, stored)
     return load_model(prepared, stored, known)
+
+
+def _model_folder(prepared: Prepared, workdir: Path, options: SfmOptions) -> Path:
+    versions = VERSION, stereo.VERSION, pycolmap.__version__, OPENCV_VERSION
+    return folder_of(prepared, workdir) / f"model-{digest(*versions, options)}"
+
+
+def has_model(prepared: Prepared, workdir: Path, options: SfmOptions) -> bool:
+    """Whether the cameras of these photos are kept in `workdir`, so that `reconstruct_photos` reads them."""
+    return is_stored(_model_folder(prepared, workdir, options))
 
 
 def _require_photos(prepared: Prepared) -> None:
@@ -155,7 +159,7 @@ def _no_photo(skipped: Sequence[tuple[str, str]]) -> str:
     return f"None of the {len(skipped)} files is a usable photo, such as {name}: {reason.rstrip('.')}."
 
 
-def _efforts(options: SfmOptions, count: int) -> list[Effort]:
+def efforts(options: SfmOptions, count: int) -> list[Effort]:
     """The efforts to try, in order; a single one where the options name it or set its photo size or features."""
     automatic = [STANDARD, HIGH] if count <= FEW_PHOTOS else [LEAN, STANDARD, HIGH]
     chosen = automatic if options.effort == "auto" else [EFFORTS[options.effort]]
@@ -172,7 +176,7 @@ def _solve(run: SfmRun) -> EffortResult:
     best: EffortResult | None = None
     last: EffortResult | None = None
     best_counts = 0, 0
-    for effort in _efforts(run.options, run.count):
+    for effort in efforts(run.options, run.count):
         if best is not None and last is not None:
             if _finds_the_same(run, last, effort):
                 require_features(run, last)
@@ -196,7 +200,7 @@ def _solve(run: SfmRun) -> EffortResult:
             break
         if effort.name != LEAN.name and not result.verified:
             break  # a higher effort than the standard one would not match either
-    assert best is not None  # _efforts returns at least one
+    assert best is not None  # efforts returns at least one
     if best_counts[0] < ENOUGH_PLACED * run.count and run.has_time_for(1.0):
         best = _without_fisheyes(run, best)
     unfold(run, best)

@@ -30,7 +30,7 @@ from splatmill_worker.errors import Cancelled, Refusal, WorkerError
 from splatmill_worker.memory import return_freed
 from splatmill_worker.tiles.folder import SCENE, Claimed, PlanFolder, digest_of, facts_of
 from splatmill_worker.tiles.retrying import may_pass
-from splatmill_worker.tiles.units import ScenePlan
+from splatmill_worker.tiles.units import DIVIDED, ScenePlan
 
 REFUSED, FAILED, UNWRITABLE, STOPPED, CLAIMED, BROKEN = 5, 3, 1, 130, 75, 70
 """Exit statuses, those of the command line: the plan or its photos cannot be used; a unit failed; a folder could not be
@@ -68,8 +68,8 @@ def make_plan(root: Path, capture: Path, options: str) -> int:
 def do_units(root: Path, names: Sequence[str], begun: int | None = None) -> int:
     """Do the units `names` one after the other, or all that can be done until none is left; returns the exit status.
 
-    Of several, those are left out that other processes do or have done. The status is that of the unit with which it
-    ends early, or the first that is not 0.
+    Of several, those are left out that other processes do or have done, or that need what these do. The status is that
+    of the unit with which it ends early, or the first that is not 0.
 
     begun: descriptor of a file to which the name of each unit is written when it begins, a line each. The process that
         reads it has begun this one, which ends with it.
@@ -127,7 +127,8 @@ def _make_plan(root: Path, capture: Path, options: TrainOptions) -> int:
         capture.rename(folder.capture)
     folder.save()
     folder.forget_failures(*(unit.name for unit in folder.plan.units))
-    kept = [name for name, ended in folder.ended().items() if ended.state == "done"]
+    left_out = _left_out(folder)
+    kept = [name for name, ended in folder.ended().items() if ended.state == "done" and name not in left_out]
     print(f"{len(folder.plan.units)} units: {listed([unit.name for unit in folder.plan.units], 4)}")
     if kept:
         print(f"done already: {listed(kept, 8)}")
@@ -150,6 +151,8 @@ def _do_one(root: Path, name: str, stopped: _StopSignals, begun: int | None, *, 
     if _is_done(folder, name):
         return 0
     missing = folder.plan.missing(name, folder.states())
+    if missing and not alone:
+        return 0  # another process does them
     if missing:
         raise Refusal(
             "option_out_of_range",
@@ -177,7 +180,10 @@ def _do_one(root: Path, name: str, stopped: _StopSignals, begun: int | None, *, 
 
             try:
                 context = Context(folder, run, _Lines(name), lambda: stopped.asked or not run.held())
-                readable = [folder.capture.resolve(), run.work.resolve()]
+                readable = [
+                    folder.capture.resolve(),
+                    *(path.resolve() for path in (run.path.parent, run.work)),
+                ]
                 with decoders.confined(readable, run.work / ENDED, context.cancelled):
                     run_unit(context)
             except Exception as error:
@@ -237,6 +243,9 @@ def _do_all(root: Path) -> int:
         if not free:
             time.sleep(POLL_SECONDS)
         else:
+            if free[0] in folder.plan.camera_names:  # short ones, for which one process is started
+                wanted = folder.plan.wanted(states)
+                free = [name for name in folder.plan.camera_names if name in wanted]
             status, last = _in_process(root, free, stopped)
             if stopped.asked:
                 raise KeyboardInterrupt
@@ -303,13 +312,24 @@ def _link_scene(root: Path, path: Path) -> None:
     new.replace(root / SCENE)
 
 
-def _rows(folder: PlanFolder) -> list[dict[str, Any]]:
+def _left_out(folder: PlanFolder) -> set[str]:
+    """The units that the scene does not need: those before the cameras, where these are given or there already."""
     ended, states = folder.ended(), folder.states()
+    photos = ended.get("photos")
+    divided = photos is None or photos.path is None or facts_of(photos.path).get(DIVIDED, True)
+    names = {unit.name for unit in folder.plan.units} - folder.plan.wanted(states) - set(ended)
+    return names if divided else names.union(folder.plan.camera_names[1:-1])
+
+
+def _rows(folder: PlanFolder) -> list[dict[str, Any]]:
+    ended, states, left_out = folder.ended(), folder.states(), _left_out(folder)
     rows = []
     for unit in folder.plan.units:
         row: dict[str, Any] = {"unit": unit.name}
         end = ended.get(unit.name)
-        if end is not None and end.path is not None:
+        if unit.name in left_out:
+            row |= {"state": "left out"}
+        elif end is not None and end.path is not None:
             facts = facts_of(end.path)
             row |= {"state": "done", "folder": str(end.path)} | {
                 name: facts[name] for name in ("seconds", "gaussians", "photos", "psnr") if name in facts
@@ -328,7 +348,7 @@ def _rows(folder: PlanFolder) -> list[dict[str, Any]]:
 
 def _table(rows: list[dict[str, Any]]) -> str:
     lines = []
-    for row in rows:
+    for row in [row for row in rows if row["state"] != "left out"]:
         parts = [f"{row['unit']:<10} {row['state']:<8}"]
         if "seconds" in row:
             parts.append(format_duration(row["seconds"]))

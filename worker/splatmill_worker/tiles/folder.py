@@ -127,8 +127,8 @@ class PlanFolder:
         found: dict[str, Ended] = {}
         states: dict[str, State] = {}
         for unit in self.plan.units:
-            if self.plan.missing(unit.name, states):
-                continue
+            if self.plan.depends_on_failures(unit.name) and self.plan.missing(unit.name, states):
+                continue  # the name of its output is not known yet
             path = self._path(unit.name, states)
             if (path / DONE).is_file():
                 found[unit.name] = Ended("done", path)

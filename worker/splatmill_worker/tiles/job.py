@@ -29,17 +29,18 @@ from splatmill_worker.pipeline.events import Emit
 from splatmill_worker.pipeline.job import check_lpips, choose_kernels
 from splatmill_worker.pipeline.live import Looks, Onlookers
 from splatmill_worker.pipeline.stages import Outcome
+from splatmill_worker.sfm.run import SFM
 from splatmill_worker.tiles.folder import TILES, PlanFolder, digest_of, facts_of
 from splatmill_worker.tiles.remaining import Remaining
 from splatmill_worker.tiles.retrying import may_pass
-from splatmill_worker.tiles.stages import CHECKPOINTS, PLAN_FILE, SFM, Context, run_unit
-from splatmill_worker.tiles.units import ScenePlan
+from splatmill_worker.tiles.stages import CHECKPOINTS, PLAN_FILE, Context, run_unit
+from splatmill_worker.tiles.units import DIVIDED, ScenePlan
 
 WAIT_SECONDS = 1.0
 """Time between two looks for the tiles that other processes do, while nothing is left for this one."""
 
-STATES = {"cameras": JobState.sfm, "scene": JobState.exporting}
-"""The state that a job enters with a unit; with every other unit, it is `training`."""
+STAGES = {"features": "features", "matches": "matching"}
+"""Stages of the progress of a job while other processes do its last units of a kind; of other kinds, it is `tiles`."""
 
 
 UNIT_FACTS = ("seconds", "photos", "gaussians")
@@ -64,6 +65,9 @@ class Others(Protocol):
     def gather(self, folder: PlanFolder) -> None:
         """Bring the outputs of others into the folder of the plan."""
 
+    def forget(self, outputs: Sequence[Path]) -> None:
+        """Let others have outputs of units no longer, as no unit needs them."""
+
     def end(self) -> None:
         """Take back all that nobody has begun."""
 
@@ -87,13 +91,21 @@ class Nobody:
     def gather(self, folder: PlanFolder) -> None:
         """Do nothing."""
 
+    def forget(self, outputs: Sequence[Path]) -> None:
+        """Do nothing."""
+
     def end(self) -> None:
         """Do nothing."""
 
 
 @dataclass(frozen=True)
 class _Work:
-    """What all units of a job are done with."""
+    """What all units of a job are done with.
+
+    entered: the states that the job has entered.
+    left_out: names of units that have nothing to do.
+    reported: the last state that was emitted of each unit.
+    """
 
     folder: PlanFolder
     workdir: Path
@@ -102,13 +114,17 @@ class _Work:
     looks: Looks | None
     others: Others
     entered: list[JobState] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)
     reported: dict[str, str] = field(default_factory=dict)
 
     def report(
         self, name: str, state: Literal["running", "elsewhere", "done", "failed"], output: Path | None = None
     ) -> None:
-        """Emit the state of a unit, unless that was the last one. output: folder of one that is done, for its facts."""
-        if self.reported.get(name) == state:
+        """Emit the state of a unit, unless that was the last one, or it has nothing to do.
+
+        output: folder of one that is done, for its facts.
+        """
+        if self.reported.get(name) == state or name in self.left_out:
             return
         self.reported[name] = state
         facts: dict[str, Any] = {} if output is None else facts_of(output)
@@ -165,10 +181,13 @@ def _step(work: _Work) -> None:
     folder, others = work.folder, work.others
     ended = folder.ended()
     states = {name: end.state for name, end in ended.items()}
+    photos = ended.get("photos")
+    if photos is not None and photos.path is not None and not facts_of(photos.path)[DIVIDED]:
+        work.left_out[:] = folder.plan.camera_names[1:-1]
     for name, end in ended.items():
         work.report(name, end.state, end.path)
     ready = folder.plan.ready(states)
-    tiles = [name for name in ready if name in folder.plan.part_names]
+    tiles = [name for name in ready if name in folder.plan.part_names and name not in work.left_out]
     # What failed here is not known elsewhere: the last steps beside a tile that failed are left to this process.
     offered = [name for name in tiles if "failed" not in map(states.get, folder.plan.unit(name).needs)]
     if offered:
@@ -189,7 +208,9 @@ def _step(work: _Work) -> None:
 def _do(work: _Work, name: str) -> None:
     """Do a unit. The failure of a tile is recorded; that of another unit is raised."""
     folder = work.folder
-    state = STATES.get(name, JobState.training)
+    state = JobState.exporting if name == "scene" else JobState.training
+    if name in folder.plan.camera_names:
+        state = JobState.sfm
     if state not in work.entered:
         work.entered.append(state)
         work.emit(StateEvent(state=state))
@@ -217,30 +238,46 @@ def _do(work: _Work, name: str) -> None:
             return
     return_freed()
     work.report(name, "done", run.path)
-    if name != "scene":
+    if name != "scene" and name not in work.left_out:
         work.others.stored(run.path)
-    if name == "cameras" and (run.path / SFM).is_dir():
-        # Where the service looks for cameras that other jobs on the capture can use; given ones have none.
-        shutil.copytree(run.path / SFM, work.workdir / SFM, copy_function=_link, dirs_exist_ok=True)
+    if name == "cameras":
+        if (run.path / SFM).is_dir():
+            # Where the service looks for cameras that other jobs on the capture can use; given ones have none.
+            shutil.copytree(run.path / SFM, work.workdir / SFM, copy_function=_link, dirs_exist_ok=True)
+        _forget_features(work)
     elif name == "coarse":
         shutil.rmtree(work.workdir / CHECKPOINTS, ignore_errors=True)
         work.workdir.joinpath(PLAN_FILE).unlink(missing_ok=True)
-    elif name in folder.plan.part_names:
+    elif name in folder.plan.tile_names + folder.plan.seam_names:
         facts = facts_of(run.path)
         if facts["photos"]:
             message = f"{name} is trained: {facts['gaussians']:,} Gaussians, {facts['photos']} photos."
             work.emit(LogEvent(message=message))
 
 
-def _wait(work: _Work, tiles: Sequence[str]) -> None:
-    """Wait for tiles that other processes do."""
-    parts, states = work.folder.plan.part_names, work.folder.states()
+def _forget_features(work: _Work) -> None:
+    """Remove what only the cameras needed: features of 1,000 photos and their matches take 0.2 GB or more."""
+    ended = work.folder.ended()
+    names = [name for name in work.folder.plan.camera_names[1:-1] if name in ended]
+    outputs = [path for name in names if (path := ended[name].path) is not None]
+    work.others.forget([path for path in outputs if path.name.rpartition("-")[0] not in work.left_out])
+    for path in outputs:
+        shutil.rmtree(path)
+
+
+def _wait(work: _Work, parts: Sequence[str]) -> None:
+    """Wait for units that other processes do."""
+    plan, states = work.folder.plan, work.folder.states()
+    kind = parts[0].partition("-")[0]
+    alike = {"features": plan.feature_names, "matches": plan.match_names}.get(
+        kind, plan.tile_names + plan.seam_names
+    )
     work.emit(
         ProgressEvent(
-            stage="tiles",
-            done=sum(name in states for name in parts),
-            total=len(parts),
-            note=f"waiting for {listed(tiles, 4)}, which other workers train",
+            stage=STAGES.get(kind, "tiles"),
+            done=sum(name in states for name in alike),
+            total=len(alike),
+            note=f"waiting for {listed(parts, 4)}, which other workers do",
         )
     )
     time.sleep(WAIT_SECONDS)
@@ -251,12 +288,14 @@ class _Events:
 
     def __init__(self, work: _Work, name: str, folder: Path) -> None:
         self._work, self._name, self._folder = work, name, folder
+        plan = work.folder.plan
+        several = plan.blocks if name in plan.camera_names else plan.tiles
         self._label = {"coarse": "coarse model", "scene": "whole scene"}.get(
-            name, f"{name.replace('-', ' ')} of {work.folder.plan.tiles}"
+            name, f"{name.replace('-', ' ')} of {several}"
         )
         self._began = time.monotonic()
         self._remaining: Remaining | None = None
-        if name in work.folder.plan.part_names:
+        if name in work.folder.plan.tile_names + work.folder.plan.seam_names:
             ended = work.folder.ended().items()
             seconds = {
                 unit: None if end.path is None else facts_of(end.path)["seconds"] for unit, end in ended
@@ -267,7 +306,7 @@ class _Events:
         if isinstance(event, PreviewEvent | CamerasEvent):
             path = (self._folder / event.path).relative_to(self._work.workdir)
             event = event.model_copy(update={"path": path.as_posix()})
-        elif isinstance(event, ProgressEvent) and self._name != "cameras":
+        elif isinstance(event, ProgressEvent) and self._name not in ("photos", "pairs", "cameras"):
             note = self._label if event.note is None else f"{self._label}: {event.note}"
             eta = event.eta
             if self._remaining is not None and eta is not None:

@@ -1,4 +1,5 @@
-"""What each unit of a plan does: cameras, the coarse model, a tile, its last steps, and the scene that all make."""
+"""What each unit of a plan does: cameras and what they follow from, the coarse model, a tile, its last steps, and the
+scene that all make."""
 
 from __future__ import annotations
 
@@ -17,19 +18,22 @@ from splatmill.files import replacing
 from splatmill.schema import Backend, PlanEvent, Switch, TrainOptions
 from splatmill_worker.images.load import training_size
 from splatmill_worker.pipeline.cameras import Cameras, recover_cameras
-from splatmill_worker.pipeline.events import Emit
+from splatmill_worker.pipeline.events import Emit, progress_events
 from splatmill_worker.pipeline.first_gaussians import seeded
 from splatmill_worker.pipeline.job import Job, choose_kernels
 from splatmill_worker.pipeline.live import Looks
 from splatmill_worker.pipeline.planning import plan_training, planned_photos
 from splatmill_worker.pipeline.stage_times import Stages
 from splatmill_worker.pipeline.training import train_scene
+from splatmill_worker.sfm import blocks
+from splatmill_worker.sfm.effort import SCORES
+from splatmill_worker.sfm.run import SFM
 from splatmill_worker.splat.engine.open import open_engine
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.plan.capacity import resolved
 from splatmill_worker.splat.plan.photos import loading_size, statistics_memory
 from splatmill_worker.splat.plan.plan import Kernels, Plan
-from splatmill_worker.tiles import coarse_model, joined
+from splatmill_worker.tiles import camera_parts, coarse_model, joined
 from splatmill_worker.tiles.cells import divide
 from splatmill_worker.tiles.folder import PlanFolder, Run, facts_of
 from splatmill_worker.tiles.tile import COARSE_SHARE, Tile, train_tile
@@ -37,9 +41,6 @@ from splatmill_worker.tiles.units import ScenePlan, seam_name, tile_name, tile_n
 
 CHECKPOINTS, PLAN_FILE = "checkpoints", "plan.json"
 """The folder of the checkpoints and the file of the plan of a training, in its work folder."""
-
-SFM = "sfm"
-"""Folder of the recovered cameras in a work folder, and in the output of the unit `cameras`."""
 
 
 @dataclass(frozen=True)
@@ -72,11 +73,15 @@ class Context:
         """
         work = self.run.work
         work.joinpath("out").mkdir(exist_ok=True)
-        if self.run.name not in self.folder.plan.part_names:
-            cameras = self.folder.ended().get("cameras")
+        ended = self.folder.ended()
+        if self.run.name in ("photos", "cameras", "coarse", "scene"):
+            cameras = ended.get("cameras")
             known = self.known if cameras is None or cameras.path is None else cameras.path / SFM
             if known is not None and known.is_dir():
                 shutil.copytree(known, work / SFM, dirs_exist_ok=True)
+        prepared = None
+        if "photos" in self.folder.plan.unit(self.run.name).needs:
+            prepared = camera_parts.stored_photos(self.output("photos"), self.folder.capture)
         if self.kept is not None:
             checkpoints, plan = self.kept / CHECKPOINTS, self.kept / PLAN_FILE
             checkpoints.mkdir(exist_ok=True)
@@ -88,7 +93,12 @@ class Context:
             kernels = choose_kernels(options)
         looks = self.looks if self.run.name in ("cameras", "coarse") else None
         options = options.model_copy(update={"time_lapse": Switch.off})
-        return Job(self.folder.capture, work, options, kernels, self.emit, self.cancelled, looks)
+        return Job(self.folder.capture, work, options, kernels, self.emit, self.cancelled, looks, prepared)
+
+    def outputs(self, *units: str) -> list[Path]:
+        """The folders of the outputs of those of the units that are done."""
+        ended = self.folder.ended()
+        return [path for unit in units if (path := ended[unit].path) is not None]
 
     def output(self, unit: str) -> Path:
         """The folder of the output of a unit that is done."""
@@ -106,6 +116,8 @@ def run_unit(context: Context) -> None:
     stages = Stages(context.run.work / "stages.json")
     if name == "cameras":
         facts = _cameras(context, stages)
+    elif name in context.folder.plan.camera_names:
+        facts = _before_cameras(context)
     elif name == "coarse":
         facts = _coarse(context, stages)
     elif name == "scene":
@@ -115,8 +127,23 @@ def run_unit(context: Context) -> None:
     context.run.publish({"seconds": round(time.perf_counter() - started, 1), **facts})
 
 
+def _before_cameras(context: Context) -> dict[str, Any]:
+    plan, name, out = context.folder.plan, context.run.name, context.run.out
+    job = context.job(plan.options)
+    shutil.rmtree(out)
+    out.mkdir()
+    if name == "photos":
+        return camera_parts.examine_photos(job, out)
+    return camera_parts.do_part(job, name, plan.blocks, context.outputs(*plan.unit(name).needs), out)
+
+
 def _cameras(context: Context, stages: Stages) -> dict[str, Any]:
     job = context.job(context.folder.plan.options)
+    parts = context.outputs(*context.folder.plan.unit("cameras").needs)
+    report = progress_events(job.emit)
+    blocks.merge(
+        parts, job.workdir, lambda done, total: report("matching", done, total, blocks.MERGING), job.cancelled
+    )
     cameras = recover_cameras(job, stages)
     folder = job.workdir / SFM
     shutil.rmtree(context.run.out)  # what recovering leaves there is not for others
@@ -124,7 +151,7 @@ def _cameras(context: Context, stages: Stages) -> dict[str, Any]:
         shutil.copytree(model, context.run.out / model.relative_to(job.workdir))
     for points in sorted(folder.rglob("*.npz")):  # triangulated, and of stereo
         target = context.run.out / points.relative_to(job.workdir)
-        if not target.exists():
+        if points.name != SCORES and not target.exists():
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(points, target)
     return {"photos": len(cameras.training), "held_out": len(cameras.held_out)}

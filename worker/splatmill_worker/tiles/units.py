@@ -11,11 +11,20 @@ from typing import Any, Literal
 
 from splatmill.schema import TrainOptions
 
-FORMAT = 6
+FORMAT = 7
 """Version of the plan's format and of what its units make: another one makes everything anew."""
 
-CAMERA_OPTIONS = ("sfm_effort", "matcher", "mapper", "max_video_frames", "scale", "seed", "start")
+PHOTO_OPTIONS = ("max_video_frames", "seed", "sfm_effort", "matcher")
+"""Options that features and matches follow from, and where these are kept."""
+
+CAMERA_OPTIONS = (*PHOTO_OPTIONS, "mapper", "scale", "start")
 """Options that the cameras and the points follow from. The others do not change them."""
+
+DIVIDED = "divided"
+"""Fact of the unit `photos`: whether the units between it and the cameras have something to do."""
+
+MOST_BLOCKS = 64
+"""Blocks of photos, and of their pairs, at most: more machines than that do not find the cameras together."""
 
 State = Literal["done", "failed"]
 
@@ -55,6 +64,26 @@ class ScenePlan:
         assert self.options.tiles is not None
         return self.options.tiles
 
+    @property
+    def blocks(self) -> int:
+        """How many parts the photos are divided into, and their pairs."""
+        return min(self.tiles, MOST_BLOCKS)
+
+    @cached_property
+    def feature_names(self) -> tuple[str, ...]:
+        """The units that find the features of a block of the photos each."""
+        return tuple(f"features-{number}" for number in range(1, self.blocks + 1))
+
+    @cached_property
+    def match_names(self) -> tuple[str, ...]:
+        """The units that match a block of the pairs of photos each."""
+        return tuple(f"matches-{number}" for number in range(1, self.blocks + 1))
+
+    @cached_property
+    def camera_names(self) -> tuple[str, ...]:
+        """The units whose outputs follow from the photos and CAMERA_OPTIONS alone. The last one makes the cameras."""
+        return ("photos", *self.feature_names, "pairs", *self.match_names, "cameras")
+
     @cached_property
     def tile_names(self) -> tuple[str, ...]:
         """The units that train the tiles. They need the output of the coarse model alone, and not the capture."""
@@ -68,18 +97,23 @@ class ScenePlan:
     @cached_property
     def part_names(self) -> tuple[str, ...]:
         """The units that several machines do at a time, in the order of their numbers in the queue, from 1."""
-        return self.tile_names + self.seam_names
+        return self.tile_names + self.seam_names + self.feature_names + self.match_names
 
     @cached_property
     def units(self) -> tuple[Unit, ...]:
         """All units, each after those that it needs."""
+        features, matches = self.feature_names, self.match_names
         tiles, seams = self.tile_names, self.seam_names
         return (
-            Unit("cameras"),
-            Unit("coarse", ("cameras",)),
+            Unit("photos"),
+            *(Unit(name, ("photos",)) for name in features),
+            Unit("pairs", ("photos", *features), features),
+            *(Unit(name, ("photos", *features, "pairs"), features) for name in matches),
+            Unit("cameras", ("photos", *features, "pairs", *matches), features + matches),
+            Unit("coarse", ("photos", "cameras")),
             *(Unit(name, ("coarse",)) for name in tiles),
             *(Unit(name, ("coarse", *tiles), tiles) for name in seams),
-            Unit("scene", ("cameras", "coarse", *tiles, *seams), tiles + seams),
+            Unit("scene", ("photos", "cameras", "coarse", *tiles, *seams), tiles + seams),
         )
 
     def unit(self, name: str) -> Unit:
@@ -101,20 +135,40 @@ class ScenePlan:
         """
         own: dict[str, Any] = {"format": FORMAT, "unit": name, "capture": self.digest}
         options = self._chosen
-        if name == "cameras":
-            own["options"] = {option: options[option] for option in CAMERA_OPTIONS}
+        if name in self.camera_names:
+            # Where a block has failed, a unit after it does that itself, and makes the same.
+            used = CAMERA_OPTIONS if name == "cameras" else PHOTO_OPTIONS
+            own["options"] = {option: options[option] for option in used}
+            if name in self.part_names:
+                own["blocks"] = self.blocks
         else:
             own["options"] = options
             own["failed"] = [need for need in self.unit(name).optional if states.get(need) == "failed"]
         return hashlib.sha256(json.dumps(own, sort_keys=True).encode()).hexdigest()[:16]
 
+    def depends_on_failures(self, name: str) -> bool:
+        """Whether the output of a unit is another one where units before it have failed."""
+        return bool(self.unit(name).optional) and name not in self.camera_names
+
     def ready(self, states: Mapping[str, State]) -> list[str]:
-        """Names of the units that have not ended and whose needs are met, in the order of the plan."""
+        """Names of the units that the scene needs, that have not ended and whose needs are met, in the order of the
+        plan."""
+        wanted = self.wanted(states)
         return [
-            unit.name
-            for unit in self.units
-            if unit.name not in states and not self.missing(unit.name, states)
+            unit.name for unit in self.units if unit.name in wanted and not self.missing(unit.name, states)
         ]
+
+    def wanted(self, states: Mapping[str, State]) -> set[str]:
+        """The units that have not ended and that the scene still needs: not those before the cameras, once these are
+        there."""
+        found: set[str] = set()
+        left = ["scene"]
+        while left:
+            name = left.pop()
+            if name not in states and name not in found:
+                found.add(name)
+                left += self.unit(name).needs
+        return found
 
     def missing(self, name: str, states: Mapping[str, State]) -> list[str]:
         """The units that must end before the unit `name` can be run."""
@@ -124,11 +178,6 @@ class ScenePlan:
             for need in unit.needs
             if states.get(need) != "done" and not (need in unit.optional and states.get(need) == "failed")
         ]
-
-    def before(self, name: str) -> set[str]:
-        """The units that end before the unit `name` can be run: those that it needs, and what these need."""
-        needs = self.unit(name).needs
-        return {*needs, *(unit for need in needs for unit in self.before(need))}
 
     def as_dict(self) -> dict[str, Any]:
         """The plan as JSON has it."""

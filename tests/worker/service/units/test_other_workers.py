@@ -82,6 +82,31 @@ def test_tiles_are_offered_where_their_copies_fit_and_all_copies_are_counted(
     assert warnings == []
 
 
+def test_what_no_unit_needs_any_more_is_deleted_and_leaves_its_room_to_others(
+    local: Storage, connection: redis.Redis, others: OtherWorkers, plan: PlanFolder, warnings: list[str]
+) -> None:
+    reservations.note_limit(connection, "default", 10_000)
+    with plan.claimed("features-1") as run:
+        run.out.joinpath("sfm").mkdir(parents=True)
+        run.out.joinpath("sfm", "database.db").write_bytes(bytes(5_000))
+        run.publish({})
+    others.begin(plan)
+    before = stored(local)
+    assert set(before) == {"features-1", "cameras", "coarse"}
+    assert reservations.used(connection, "default") == sum(before.values())
+    others.forget([plan.output("features-1"), plan.output("features-2")])
+    left = stored(local)
+    assert left == {name: before[name] for name in ("cameras", "coarse")}
+    with plan.claimed("tile-1") as run:
+        run.out.mkdir()
+        run.out.joinpath("c").write_bytes(bytes(5_000))
+        run.publish({})
+    others.stored(plan.output("tile-1"))
+    assert "tile-1" in stored(local)
+    assert warnings == []
+    assert reservations.used(connection, "default") == sum(before.values())
+
+
 def test_without_room_for_copies_no_tile_is_offered_and_nothing_more_is_stored(
     local: Storage, connection: redis.Redis, others: OtherWorkers, plan: PlanFolder, warnings: list[str]
 ) -> None:
@@ -94,7 +119,7 @@ def test_without_room_for_copies_no_tile_is_offered_and_nothing_more_is_stored(
     assert reservations.used(connection, "default") == sizes["cameras"]
     (warning,) = warnings
     assert warning.startswith(
-        "This worker trains all tiles that no other has begun: copies for other workers do not fit."
+        "This worker does all parts that no other has begun: copies for other workers do not fit."
     )
     assert "of 2.0 kB in storage" in warning
 

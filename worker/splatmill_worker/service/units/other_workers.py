@@ -23,7 +23,7 @@ class OtherWorkers:
     A tile waits in the queue until a worker takes it, or the attempt takes it back to do it itself. So nobody waits for
     a worker that does not come, and no tile is done by two unless one of them is lost.
 
-    Where the owner's quota has no room for copies of what they need, no tile is begun by them from then on.
+    Where the owner's quota has no room for copies of what they need, no part is begun by them from then on.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class OtherWorkers:
             self._alone = True
             self.end()
             self._warn(
-                f"This worker trains all tiles that no other has begun: copies for other workers do not fit. {error}"
+                f"This worker does all parts that no other has begun: copies for other workers do not fit. {error}"
             )
 
     def offer(self, tiles: Sequence[str]) -> None:
@@ -81,6 +81,12 @@ class OtherWorkers:
         brought = dict(self._units.bring(folder, check=self._job_folder.check_space))
         if brought:
             self._room.store(brought, may_refuse=False)
+
+    def forget(self, outputs: Sequence[Path]) -> None:
+        """Delete outputs from storage. Their room in the owner's quota is for what the job stores next."""
+        dropped = self._units.drop([path.name for path in outputs])
+        if dropped:
+            self._room.store(dict.fromkeys(dropped, 0), may_refuse=False)
 
     def end(self) -> None:
         """Take all tiles out of the queue that no worker has begun."""

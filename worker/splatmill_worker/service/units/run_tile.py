@@ -19,7 +19,7 @@ from splatmill.backplane.storage.storage import Storage
 from splatmill_worker.errors import WorkerError
 from splatmill_worker.service import hand_back
 from splatmill_worker.service.disk_reserve import DiskWatch
-from splatmill_worker.service.job_folder import TileFolder
+from splatmill_worker.service.job_folder import ENDED, TileFolder
 from splatmill_worker.service.process_exit import HANDED_BACK_STATUS, WITHDRAWN_STATUS
 from splatmill_worker.service.redis_patience import patiently
 from splatmill_worker.service.units.stored_units import StoredUnits
@@ -99,13 +99,22 @@ def _train(entry: TileEntry, row: JobRow, stopped: Callable[[], bool]) -> None:
         folder.run.mkdir(parents=True, exist_ok=True)
         tiles = PlanFolder(folder.run, plan)
         tiles.release()
-        units.bring(tiles, only=(*plan.before(name), name), check=folder.check_space)
+        units.bring(tiles, only=(*plan.unit(name).needs, name), check=folder.check_space)
         if name in tiles.states() or tiles.plan.missing(name, tiles.states()):
             return
         # Not imported by the worker that forks this process: numpy and torch start threads.
+        from splatmill_worker.images.decoding import decoders
+        from splatmill_worker.tiles.camera_parts import block_of, files_of_block
         from splatmill_worker.tiles.stages import Context, run_unit
 
-        with tiles.claimed(name) as run:
+        if name in plan.feature_names:
+            photos = files_of_block(tiles.output("photos"), block_of(name, plan.blocks))
+            folder.stage_capture(only=photos)
+            tiles.place(folder.capture)
+        with (
+            tiles.claimed(name) as run,
+            decoders.confined([folder.path], run.work / ENDED, stopped),
+        ):
             run_unit(Context(tiles, run, lambda event: None, stopped))
         units.put(run.path)
     finally:

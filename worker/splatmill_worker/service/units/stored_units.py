@@ -58,6 +58,22 @@ class StoredUnits:
             for path, name in zip(files, names, strict=True):
                 self._storage.put(f"{target}/{name}", path)
 
+    def drop(self, outputs: Sequence[str]) -> list[str]:
+        """Delete outputs, the last file of each first. Return the names of their files.
+
+        outputs: names of their folders.
+        """
+        dropped = []
+        for output in outputs:
+            folder = f"{self._prefix}/{output}"
+            entries = [entry.path for entry in self._storage.entries(folder)]
+            self._storage.delete(
+                f"{folder}/{DONE}"
+            )  # what is left of it is being stored, for all that others know
+            self._storage.delete_prefix(folder)
+            dropped += [path.removeprefix(f"{self._prefix}/") for path in entries]
+        return dropped
+
     def drop_others(self, folder: PlanFolder) -> None:
         """Remove outputs from the folder of the plan where others are stored, which tiles may follow from."""
         for ended in folder.ended().values():

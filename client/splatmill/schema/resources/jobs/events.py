@@ -143,11 +143,14 @@ class SnapshotEvent(Response):
 
 
 class UnitEvent(Response):
-    """A unit of a scene in tiles began or ended: cameras, coarse model, a tile or its last steps, or the whole."""
+    """A unit of a scene in tiles began or ended: a part of the search for cameras, these, the coarse model, a tile or its
+    last steps, or the whole."""
 
     type: Literal["unit"] = "unit"
     unit: str = Field(
-        max_length=64, description="Name of the unit: cameras, coarse, tile-1, ..., seam-1, ..., scene."
+        max_length=64,
+        description="Name of the unit: photos, features-1, ..., pairs, matches-1, ..., cameras, coarse, tile-1, ..., "
+        "seam-1, ..., scene.",
     )
     state: Literal["running", "elsewhere", "done", "failed"] = Field(
         description="elsewhere: another worker had it when that of the job looked, between two of its units. What is "

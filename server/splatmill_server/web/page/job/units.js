@@ -4,7 +4,12 @@ import { h } from "../dom.js";
 import { number, seconds } from "../format.js";
 
 /** The kinds of units, in the order in which they are done. @type {[string, string][]} */
-const KINDS = [["cameras", "Cameras"], ["coarse", "Coarse model"], ["tile", "Tiles"], ["seam", "Last steps of tiles"], ["scene", "Whole scene"]];
+const KINDS = [["photos", "Photos"], ["features", "Features of photos"], ["pairs", "Pairs of photos"], ["matches", "Matches of pairs"],
+  ["cameras", "Cameras"], ["coarse", "Coarse model"], ["tile", "Tiles"], ["seam", "Last steps of tiles"], ["scene", "Whole scene"]];
+/** Those that are left out where no unit of the kind has begun: the cameras are given, or one unit finds them. */
+const OPTIONAL = ["features", "pairs", "matches"];
+/** Those of which there are as many as tiles. */
+const OF_TILES = ["tile", "seam"];
 /** Names that are written out; of others, their number is. */
 const MOST_NAMES = 6;
 
@@ -19,16 +24,18 @@ export function unitParts(units) {
       h("th", { scope: "col" }, "In work or failed"),
       h("th", { scope: "col", class: "number" }, "Gaussians"),
       h("th", { scope: "col", class: "number" }, "Time of one"))),
-    h("tbody", {}, KINDS.map(([kind, title]) => {
+    h("tbody", {}, KINDS.flatMap(([kind, title]) => {
       const those = events.filter(({ unit }) => unit === kind || unit.startsWith(`${kind}-`));
+      if (!those.length && OPTIONAL.includes(kind)) return [];
       const done = those.filter(({ state }) => state === "done");
-      const all = kind === "tile" || kind === "seam" ? tiles : 1;
-      return h("tr", {},
+      const several = OF_TILES.includes(kind) ? `${number(done.length)} of ${number(tiles)}` : number(done.length);
+      const one = !OF_TILES.includes(kind) && those.every(({ unit }) => unit === kind);
+      return [h("tr", {},
         h("th", { scope: "row" }, title),
-        h("td", { class: "number" }, all === 1 ? (done.length ? "✓" : "") : `${number(done.length)} of ${number(all)}`),
+        h("td", { class: "number" }, one ? (done.length ? "✓" : "") : several),
         h("td", {}, work(those)),
         h("td", { class: "number" }, figure(done.reduce((sum, { gaussians }) => sum + (gaussians ?? 0), 0), number)),
-        h("td", { class: "number" }, figure(mean(done), seconds)));
+        h("td", { class: "number" }, figure(mean(done), seconds)))];
     }))));
 }
 
@@ -36,10 +43,10 @@ export function unitParts(units) {
 function work(units) {
   const words = { running: "", elsewhere: " on other workers", failed: " failed" };
   return Object.entries(words).flatMap(([state, where]) => {
-    const names = units.filter((unit) => unit.state === state).map(({ unit }) => unit.replace(/^(tile|seam)-/, ""));
+    const names = units.filter((unit) => unit.state === state).map(({ unit }) => unit.replace(/^(features|matches|tile|seam)-/, ""));
     if (!names.length) return [];
     const several = names.every((name) => /^[0-9]+$/.test(name));
-    const listed = !several ? (state === "running" ? "yes" : "") : names.length > MOST_NAMES ? `${number(names.length)} tiles` : names.join(", ");
+    const listed = !several ? (state === "running" ? "yes" : "") : names.length > MOST_NAMES ? number(names.length) : names.join(", ");
     return [`${listed}${where}`.trim()];
   }).join("; ");
 }

@@ -1,0 +1,165 @@
+"""Proves that features and matches found in blocks are those that one process finds, also where a block was lost, and
+that the mapping begins from them.
+
+Proven on generated photos of two sizes, some of them masked. Does not prove that other machines find the blocks
+(tests/worker/service/units, tests/service/test_tiles.py).
+"""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from contextlib import closing, suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from splatmill_worker import sfm, synthetic
+from splatmill_worker.errors import Cancelled
+from splatmill_worker.images.prepare import Prepared, prepare
+from splatmill_worker.sfm import blocks
+from splatmill_worker.sfm.blocks import Block
+from splatmill_worker.sfm.features import photos_in
+
+pytestmark = pytest.mark.slow
+
+COUNT = 16
+OPTIONS = sfm.SfmOptions(stereo=False)
+
+
+def silent(stage: str, done: int, total: int, note: str) -> None:
+    """Report nothing."""
+
+
+def never() -> bool:
+    return False
+
+
+@pytest.fixture(scope="module")
+def prepared(tmp_path_factory: pytest.TempPathFactory) -> Prepared:
+    """Photos of two sizes, more than are matched exhaustively, of which one has a mask."""
+    root = tmp_path_factory.mktemp("blocks")
+    synthetic.capture(root / "images", COUNT - 4, 240, 180, samples=1)
+    synthetic.capture(root / "small", 4, 160, 120, samples=1)
+    for path in (root / "small").iterdir():
+        shutil.move(path, root / "images" / f"s-{path.name}")
+    masked = sorted((root / "images").iterdir())[3]
+    (root / "masks").mkdir()
+    mask = np.full((180, 240), 255, np.uint8)
+    mask[:, :60] = 0
+    Image.fromarray(mask).save(root / "masks" / f"{masked.stem}.png")
+    found = prepare(root / "images", root / "masks", root)
+    assert (len(found.photos), sum(photo.mask is not None for photo in found.photos)) == (COUNT, 1)
+    return found
+
+
+@pytest.fixture(scope="module")
+def whole(prepared: Prepared, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The work folder of one process that was stopped when it began to place photos."""
+    work, stages = tmp_path_factory.mktemp("whole"), [""]
+    with pytest.raises(Cancelled):
+        sfm.reconstruct_photos(
+            prepared, work, OPTIONS, lambda stage, *_: stages.append(stage), lambda: stages[-1] == "mapping"
+        )
+    return work
+
+
+def rows(path: Path, table: str) -> list[tuple[object, ...]]:
+    with closing(sqlite3.connect(path)) as database:
+        return sorted(database.execute(f"SELECT * FROM {table}"))
+
+
+def database_in(work: Path) -> Path:
+    """That of the first effort, where there is no other."""
+    (path,) = work.rglob("database.db")
+    return path
+
+
+def files_below(folder: Path, root: Path | None = None) -> set[Path]:
+    return {path.relative_to(root or folder) for path in folder.rglob("*") if path.is_file()}
+
+
+def in_blocks(prepared: Prepared, root: Path, count: int, lost: int | None = None) -> tuple[list[Path], Path]:
+    """The work folders of all parts, and that in which they are merged. lost: number of a block without features."""
+    features = []
+    for number in range(1, count + 1):
+        if number != lost:
+            features.append(root / f"features-{number}")
+            found = blocks.find_block(prepared, features[-1], OPTIONS, Block(number, count), silent, never)
+            assert found in (COUNT // count, COUNT // count + 1)
+    scored = root / "pairs"
+    chosen = blocks.score_pairs(prepared, scored, OPTIONS, features, silent, never)
+    assert len(photos_in(database_in(scored), with_features=True)) == (0 if lost is None else COUNT // count)
+    parts = [*features, scored]
+    matched = 0
+    for number in range(1, count + 1):
+        part = root / f"matches-{number}"
+        block = Block(number, count)
+        matched += blocks.match_block(prepared, part, OPTIONS, block, [*features, scored], silent, never)
+        assert rows(database_in(part), "descriptors") == []
+        parts.append(part)
+    assert matched == chosen > COUNT
+    before = files_below(root)
+    blocks.merge(parts, root / "all", lambda done, total: None, never)
+    assert files_below(root) - before == {
+        path for path in files_below(root / "all", root) if path.name in ("database.db", "scores.npz")
+    }, "nothing is written beside what is read"
+    return parts, root / "all"
+
+
+@pytest.mark.parametrize(("count", "lost"), [(1, None), (3, None), (3, 2)])
+def test_the_database_is_that_of_one_process(
+    prepared: Prepared, whole: Path, tmp_path: Path, count: int, lost: int | None
+) -> None:
+    _, work = in_blocks(prepared, tmp_path, count, lost)
+    merged = database_in(work)
+    whole /= merged.relative_to(work)
+    for table in ("cameras", "images", "frames", "frame_data", "rigs"):
+        assert rows(merged, table) == rows(whole, table), table
+    for table in ("two_view_geometries", "matches"):  # of one process, also the pairs that connect components
+        assert set(rows(merged, table)) <= set(rows(whole, table)), table
+    assert len(rows(whole, "cameras")) == 2
+    for table in ("keypoints", "descriptors"):
+        assert rows(merged, table) == rows(whole, table), table
+
+
+def test_what_is_there_is_not_found_again(prepared: Prepared, tmp_path: Path) -> None:
+    parts, work = in_blocks(prepared, tmp_path, 2)
+    before = {table: rows(database_in(work), table) for table in ("descriptors", "matches")}
+    seen = []
+    blocks.merge(parts, work, lambda done, total: seen.append((done, total)), never)  # once more
+    assert seen == [(number, 5) for number in range(1, 6)]
+    with pytest.raises(Cancelled):
+        blocks.merge(parts, work, lambda done, total: None, lambda: True)
+    assert {table: rows(database_in(work), table) for table in before} == before
+    stages = []
+    with suppress(sfm.SfmFailed):
+        sfm.reconstruct_photos(
+            prepared, work, OPTIONS, lambda stage, done, total, note: stages.append((stage, total))
+        )
+    first = next(index for index, (stage, _) in enumerate(stages) if stage == "mapping")
+    assert {stage for stage, _ in stages[:first]} <= {"matching"}, "only pairs that connect components"
+
+
+def test_progress_is_that_of_the_block_and_a_cancelled_one_ends(prepared: Prepared, tmp_path: Path) -> None:
+    seen = []
+    blocks.find_block(
+        prepared,
+        tmp_path,
+        OPTIONS,
+        Block(2, 4),
+        lambda stage, done, total, note: seen.append((stage, done, total, note)),
+        never,
+    )
+    names = [photo.name for photo in prepared.photos[4:8]]
+    assert seen == [("features", number, 4, name) for number, name in enumerate(names, 1)]
+    with pytest.raises(Cancelled):
+        blocks.find_block(prepared, tmp_path / "other", OPTIONS, Block(1, 1), silent, lambda: True)
+
+
+@pytest.mark.parametrize("blocks_of", [1, 3, 7, 64])
+def test_every_index_is_in_one_block(blocks_of: int) -> None:
+    whole = [index for number in range(1, blocks_of + 1) for index in Block(number, blocks_of).of(20)]
+    assert whole == list(range(20))
