@@ -85,3 +85,13 @@ def test_lenses_and_masks_are_told() -> None:
     assert "undistortion" in planned(changed(distorted=0)).left_out
     assert "masks" in planned().left_out
     assert "masks" not in planned(changed(masked=1)).left_out
+
+
+def test_gaussians_are_added_for_less_long_where_the_light_differs() -> None:
+    even, uneven = planned(changed(light_tail=0.0)), planned(changed(light_tail=0.3))
+    assert (even.schedule.densify_until, uneven.schedule.densify_until) == (0.7, 0.5)
+    assert "growth" not in even.reasons
+    assert "differ in their light" in uneven.reasons["growth"]
+    # It follows from the photos, not from whether their exposures are corrected.
+    assert planned(changed(light_tail=0.3), exposure="off").schedule.densify_until == 0.5
+    assert planned(changed(light_tail=0.0), exposure="on").schedule.densify_until == 0.7

@@ -19,6 +19,7 @@ from splatmill_worker.splat.plan.photos import (
     decide_image_size,
     decide_photos_on_disk,
     decide_validation,
+    differs_in_light,
     least_gain,
     undistortion,
 )
@@ -33,6 +34,10 @@ from splatmill_worker.splat.start.points import ENOUGH_POINTS
 
 OPACITY_DECAY = 0.9
 """Factor on opacities at each densification (decisions: OPACITY_DECAY)."""
+
+GROWTH, UNEVEN_GROWTH = 0.7, 0.5
+"""Shares of a run after which no Gaussians are added: where photos agree in their light, and where they do not
+(decisions: growth-until)."""
 
 DROPOUT = 0.2
 """Largest share of the Gaussians that a step leaves out: the value of Park et al. 2025 (decisions: dropout)."""
@@ -66,6 +71,7 @@ def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
         "budget": capacity.budget,
         "schedule": capacity.steps,
         "densify": (densify := decide_densification(facts, options, most, initial=initial)),
+        "growth": (growth := _growth(facts)),
         "coarse_to_fine": (coarse := _coarse_to_fine(facts, image_size.value)),
         "sh_degree": (degree := _degree(facts, options)),
         "rates": (annealing := _annealing(facts, options, steps)),
@@ -91,7 +97,7 @@ def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:
             degree=degree.value,
             densify_from=densify_from,
             densify_every=densify_every,
-            densify_until=0.7,
+            densify_until=growth.value,
             opacity_decay=OPACITY_DECAY if densify.value else 1.0,
             # Half way to the shell, so that all of the shell is spared and most of the scene is not.
             decay_within=0.5 * shell if needs.far_shell.value and shell else None,
@@ -168,6 +174,17 @@ def _alpha(facts: Facts, options: TrainOptions) -> Decision[bool]:
     """Whether photos are transparent; nothing is said of it where an option fixes the background."""
     said = not facts.transparent and options.background is Background.auto
     return Decision(facts.transparent > 0, "No photo is transparent." if said else "")
+
+
+def _growth(facts: Facts) -> Decision[float]:
+    """Share of the run after which no Gaussians are added."""
+    if differs_in_light(facts):
+        return Decision(
+            UNEVEN_GROWTH,
+            f"The photos differ in their light, which late Gaussians would learn: none are added after "
+            f"{100 * UNEVEN_GROWTH:.0f} % of the run.",
+        )
+    return Decision(GROWTH, "")
 
 
 def _coarse_to_fine(facts: Facts, image_size: int) -> Decision[bool]:

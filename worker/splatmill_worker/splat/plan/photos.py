@@ -162,6 +162,12 @@ def decide_exposure(facts: Facts, options: TrainOptions) -> Decision[bool]:
     return switch(options.exposure, _exposure(facts))
 
 
+def differs_in_light(facts: Facts) -> bool:
+    """Whether the photos differ so much in their light that their exposures are corrected where no option says
+    otherwise."""
+    return _exposure(facts).value
+
+
 def _exposure(facts: Facts) -> Decision[bool]:
     if facts.light is None:
         return Decision(
