@@ -155,8 +155,14 @@ def test_a_tile_adds_gaussians_for_as_long_as_one_piece_or_as_a_limit_stopped_th
     for limited in (True, False):
         replace(coarse, limited=limited).write(tmp_path)
         assert coarse_model.read(tmp_path).limited is limited
-    for limited, until in ((True, 0.7 / 0.8), (False, (0.7 - 0.5) / (0.5 * 0.8))):
-        growing = tile_plan(replace(coarse, limited=limited), 500, 11)
+    uneven = replace(coarse.plan, schedule=replace(coarse.plan.schedule, densify_until=0.5))
+    for of_one_piece, limited, until in (
+        (coarse.plan, True, 0.7 / 0.8),
+        (coarse.plan, False, (0.7 - 0.5) / (0.5 * 0.8)),
+        (uneven, True, 0.5 / 0.8),
+        (uneven, False, 0.0),
+    ):
+        growing = tile_plan(replace(coarse, plan=of_one_piece, limited=limited), 500, 11)
         assert growing.densify
         assert growing.max_gaussians == pytest.approx(3000 * 500 / coarse.gaussians.count, abs=1)
         assert growing.schedule.densify_until == pytest.approx(until)

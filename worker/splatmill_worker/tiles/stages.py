@@ -31,6 +31,7 @@ from splatmill_worker.sfm.run import SFM
 from splatmill_worker.splat.engine.open import open_engine
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.plan.capacity import resolved
+from splatmill_worker.splat.plan.decide import GROWTH
 from splatmill_worker.splat.plan.photos import loading_size, statistics_memory
 from splatmill_worker.splat.plan.plan import Kernels, Plan
 from splatmill_worker.tiles import camera_parts, coarse_model, joined
@@ -176,8 +177,16 @@ def _coarse(context: Context, stages: Stages) -> dict[str, Any]:
         clustered=decided.cluster_culling,
         most_kept=statistics_memory(decided.max_memory, photos.size),
     )
-    # LPIPS is measured of the whole scene.
-    trained, _ = train_scene(job, cameras, photos, replace(decided, lpips=False), engine)
+    # LPIPS is measured of the whole scene. Gaussians are added up to a share of the coarse training and a tile together,
+    # but not at the end of the former, so that they have settled when the cells are drawn (decisions: tile-growth).
+    growth = min(GROWTH, decided.schedule.densify_until / COARSE_SHARE)
+    trained, _ = train_scene(
+        job,
+        cameras,
+        photos,
+        replace(decided, lpips=False, schedule=replace(decided.schedule, densify_until=growth)),
+        engine,
+    )
     if trained.failure is not None:
         raise trained.failure
     shutil.rmtree(context.run.out)
