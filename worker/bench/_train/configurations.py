@@ -68,6 +68,10 @@ CONFIGURATIONS = {
     "no-opacity-decay": Configuration(
         "opacities stay as they are when Gaussians are added", plan={"schedule.opacity_decay": 1.0}
     ),
+    "late-growth": Configuration(
+        "Gaussians are added up to 0.7 of the run where photos differ in their light too",
+        plan={"schedule.densify_until": 0.7},
+    ),
     "no-dropout": Configuration(
         "all Gaussians in every step, however often photos come", plan={"schedule.dropout": 0.0}
     ),
