@@ -26,13 +26,6 @@ NOT_READ = (
 )
 """Files that may hold the turns."""
 
-OLD_TURNS = (
-    "worker/splatmill_worker/pipeline/",
-    "worker/splatmill_worker/splat/plan/",
-    "worker/splatmill_worker/splat/train/",
-)
-"""Folders in which turns are not checked yet."""
-
 OLD_NAMES = (".ci/", "docs/", "server/bench/", "server/setup.py", "server/web/", "tests/", "worker/")
 """Folders in which names are not checked yet."""
 
@@ -44,7 +37,7 @@ _JS_NAME = re.compile(rf"\b(?:const|let|function)\s+(?P<name>{'|'.join(sorted(NA
 
 def problems(name: str, text: str) -> Iterator[str]:
     """Each banned turn and name in the file `name` with the content `text`, as `path:line: what`."""
-    for match in _TURN.finditer(text) if not name.startswith(OLD_TURNS) else ():
+    for match in _TURN.finditer(text):
         yield f"{name}:{_line(text, match)}: the turn {' '.join(match[0].split())!r}"
     if name.startswith(OLD_NAMES):
         return

@@ -102,7 +102,7 @@ def posed_scene(
     options: those of structure from motion are read, and those of the points to start from.
     on_progress: called with the progress of structure from motion, triangulation and stereo.
     cancelled: polled; when it returns true, Cancelled is raised.
-    observer: looks at the cameras and points while structure from motion places them.
+    observer: called with the cameras and points while structure from motion places them.
     prepared: the photos, where `photos_without_cameras` has found them before.
 
     Raises Refusal for poses and points that cannot be used and for a scale that cannot be followed, and SfmFailed.

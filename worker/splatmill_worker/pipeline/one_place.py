@@ -13,7 +13,7 @@ the directions to a point then differ by less than three degrees, as those of ca
 their recovery."""
 
 MIN_POINTS = 8
-"""Points below which their distance is not known, so that nothing is said unless the cameras are in one place."""
+"""Points below which their distance is not known: there is a warning then only where the cameras are in one place."""
 
 
 def warning(scene: Scene) -> list[str]:

@@ -39,7 +39,7 @@ CAPTIONED = 160
 
 
 class ProgressFilm:
-    """Observes a training run and keeps each frame as a JPEG in `folder`, so that a later attempt goes on with them.
+    """Observes a training run and keeps each frame as a JPEG in `folder`, so that a later attempt continues with them.
 
     view: the view that is shown.
     path: from where it is shown instead, once around in the course of the film; None: from where it is.

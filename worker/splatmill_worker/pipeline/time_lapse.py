@@ -35,13 +35,13 @@ TAKEN_AT = tuple(((i + 0.5) / MOST) ** 2 for i in range(MOST))
 
 
 class TimeLapse:
-    """Observes a training run and keeps snapshots in `folder`, so that a later attempt goes on with them.
+    """Observes a training run and keeps snapshots in `folder`, so that a later attempt continues with them.
 
     folder: of the snapshots, `000.ply` and so on, each with a `000.json` that says when it was taken.
     world: the coordinates of the snapshots, those of the exported model.
     anew: drop the snapshots of earlier attempts.
     antialiased: whether the scene is trained antialiased.
-    clock: seconds; the time between two looks at it is the time of the training.
+    clock: seconds; the time between two readings of it is the time of the training.
     seconds: wall time of the snapshots in this attempt.
     """
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 class Clock:
     """Wall-clock seconds of training. Evaluation, and all else that is not training, runs inside `stopped()`.
 
-    seconds: those of earlier attempts, from which counting goes on.
+    seconds: those of earlier attempts, to which those of this one are added.
     """
 
     def __init__(self, seconds: float = 0.0) -> None:

@@ -171,7 +171,7 @@ def _start(facts: Facts) -> tuple[Decision[Literal["points", "hull", "random", "
 
 
 def _alpha(facts: Facts, options: TrainOptions) -> Decision[bool]:
-    """Whether photos are transparent; nothing is said of it where an option fixes the background."""
+    """Whether photos are transparent; without a reason where an option fixes the background."""
     said = not facts.transparent and options.background is Background.auto
     return Decision(facts.transparent > 0, "No photo is transparent." if said else "")
 

@@ -273,7 +273,7 @@ def _some(views: Sequence[TrainingView]) -> Sequence[TrainingView]:
 
 
 def _extent(scene: Scene, views: Sequence[TrainingView]) -> float:
-    """Radius around the cameras' mean that holds nine points in ten, over that which holds the cameras."""
+    """Radius around the cameras' mean that holds nine points in ten, over the one that holds the cameras."""
     centers = np.array([view.full.camera.center for view in views])
     middle = centers.mean(axis=0)
     radius = float(np.linalg.norm(centers - middle, axis=1).max())

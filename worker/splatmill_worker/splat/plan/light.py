@@ -14,7 +14,7 @@ from splatmill_worker.splat.views import TrainingView
 Float = npt.NDArray[np.float64]
 
 DARKEST, BRIGHTEST = 8, 247
-"""Grey levels of 255 between which a value tells of the light: darker ones are mostly noise, brighter ones clipped."""
+"""Grey levels of 255 between which a value measures the light: darker ones are mostly noise, brighter ones clipped."""
 
 RESIDUAL_FLOOR = 0.02
 """Natural logarithm of brightness: residuals below this floor have the same weight."""
@@ -56,7 +56,7 @@ class Light:
     departures: the part of them [n, 3] that the photos around do not predict; its mean is zero too.
     errors: standard error of an exposure [n], from the spread of the photo's points; infinite without an exposure.
     unseen: share of the variance of light that is smooth over SMOOTH_REACH which the photos around would leave
-        unpredicted: 0 where photos are close to one another, 1 where none tells anything of another.
+        unpredicted: 0 where photos are close to one another, 1 where none predicts another.
     """
 
     exposures: Float

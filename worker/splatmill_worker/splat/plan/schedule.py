@@ -9,7 +9,7 @@ from splatmill_worker.splat.plan.course import densification
 from splatmill_worker.splat.plan.rates import Annealing
 
 MANY_VISITS = 100
-"""Steps on each photo after which training begins to learn the photos by heart (decisions: dropout)."""
+"""Steps on each photo after which training begins to over-fit (decisions: dropout)."""
 
 MOST_VISITS = 400
 """Steps on each photo after which a training ends that has too few photos to set one aside, all from one side

@@ -1,6 +1,6 @@
 """How far each training photo disagrees with those around it, and what that looks like.
 
-The photos are compared in the course of a run. At its end, a long one has learnt by heart what single photos show.
+The photos are compared in the course of a run. At its end, a long one has over-fitted to what single photos show.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class Disagreement(NamedTuple):
 
 
 class Look:
-    """Compares the photos of a run once, in its course: those that are not set aside when it begins or goes on.
+    """Compares the photos of a run once, in its course: those that are not set aside when it begins or continues.
 
     seconds: what the comparison took.
     """
@@ -74,7 +74,7 @@ class Look:
         self.seconds = 0.0
 
     def is_due(self, run: TrainingRun) -> bool:
-        """Whether to compare them now. A run that goes on from a checkpoint compares them again."""
+        """Whether to compare them now. A run that continues from a checkpoint compares them again."""
         return self._found is None and (
             run.state.step >= VISITS * len(self._compared) or run.progress >= LATEST
         )
@@ -93,7 +93,7 @@ class Look:
 
 
 def disagreements(run: TrainingRun, learnt: Sequence[int]) -> tuple[Disagreement, ...]:
-    """The photos with the indices `learnt`, that which disagrees most first; none where they are too few to compare.
+    """The photos with the indices `learnt`, the one that disagrees most first; none where they are too few to compare.
 
     Photos that no step was taken on would disagree for that reason alone.
     """

@@ -129,7 +129,7 @@ class TrainingRun:
             self.poses.update(index, self.engine.pose_gradient, progress, self.state.rate_scale)
         self.state.ever_visible |= result.visible > 0
         self.health.check(self.state.step, result.loss, result.visible)
-        # Scores cost time, so they are summed only while densification goes on.
+        # Scores cost time, so they are summed only while Gaussians are added.
         self.engine.keep_scores = self.plan.densify and progress < schedule.densify_until
         if self.plan.densify and schedule.densifies(self.state.step, progress):
             self._densify()
@@ -204,7 +204,7 @@ class TrainingRun:
         self.health = LossHealth(
             lowest=self.last_good.lowest_loss, checked_from=self.state.step + len(self.views)
         )
-        self.warn(f"{failure} Training went back to the last good state and goes on {measure}.")
+        self.warn(f"{failure} Training went back to the last good state and continues {measure}.")
 
     def restore_last_good(self) -> bool:
         """Restore what was optimised from the last good snapshot; False where there is none."""
