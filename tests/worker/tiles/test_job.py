@@ -133,6 +133,9 @@ def test_units_are_done_in_order_and_stored_and_those_of_others_are_waited_for(t
     assert "tile 1 of 2" in notes
     assert "seam 2 of 2" in notes
     assert "tile 2 of 2" not in notes
+    compared = [event for event in events if isinstance(event, ProgressEvent) and event.stage == "evaluation"]
+    shown = [(event.done, event.total) for event in compared if (event.note or "").startswith("whole scene")]
+    assert shown == [(1, 3), (2, 3), (3, 3), *((done, 6) for done in range(1, 7))], "then where tiles meet"
     report = json.loads((outcome.out / "report.json").read_text())
     assert report["curve"][-1]["step"] == 150
     assert (outcome.out / "model.ply").stat().st_size > 0

@@ -126,7 +126,7 @@ def write_scene(joining: Joining) -> dict[str, Any]:
         "psnr": None if held_out is None else held_out.psnr,
         "ssim": None if held_out is None else held_out.ssim,
         "failed": [number for number, tile in enumerate(joining.tiles, 1) if tile.path is None],
-        "seams": _seams(coarse, engine),
+        "seams": _seams(coarse, engine, events),
     }
 
 
@@ -199,11 +199,12 @@ def _scores(coarse: Coarse, engine: Engine, events: TrainingEvents) -> tuple[Sco
     )
 
 
-def _seams(coarse: Coarse, engine: Engine) -> dict[str, Any] | None:
+def _seams(coarse: Coarse, engine: Engine, events: TrainingEvents) -> dict[str, Any] | None:
     """How the held-out photos are shown where two tiles meet; None without such photos or with one tile."""
     if not coarse.held_out or len(coarse.cells) < 2:
         return None
     means = coarse.gaussians.means.double().numpy()
     near = ~coarse.far
     members: list[Tensor] = [torch.from_numpy(cell.holds(means)) & near for cell in coarse.cells]
-    return asdict(Seams(coarse.gaussians, members, coarse.plan).measured(engine, coarse.held_out))
+    seams = Seams(coarse.gaussians, members, coarse.plan)
+    return asdict(seams.measured(engine, coarse.held_out, events.evaluating))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import count
 
 import torch
 from torch import Tensor
@@ -19,6 +21,9 @@ from splatmill_worker.tiles.visibility import reduced
 
 MOST_LIGHT = 0.9
 """Share of a pixel's light that one tile has at most where the pixel counts as a seam."""
+
+TILES_AT_A_TIME = 3
+"""Tiles of whose light one rendering has the shares: a colour channel each."""
 
 
 @dataclass(frozen=True)
@@ -61,13 +66,25 @@ class Seams:
     def __init__(self, coarse: Gaussians, members: Sequence[Tensor], plan: Plan) -> None:
         self._coarse, self._members, self._plan = coarse, members, plan
 
-    def measured(self, scene: Engine, views: Sequence[TrainingView]) -> SeamScore:
-        """The errors of `scene` and of the coarse model on the two parts of `views`."""
+    def measured(
+        self, scene: Engine, views: Sequence[TrainingView], on_progress: Callable[[int, int], None]
+    ) -> SeamScore:
+        """The errors of `scene` and of the coarse model on the two parts of `views`.
+
+        on_progress: called with the number of rendered views, and of all.
+        """
+        passes = math.ceil(len(self._members) / TILES_AT_A_TIME)
+        done = count(1)
+
+        def step() -> None:
+            on_progress(next(done), len(views) * (passes + 1))
+
         background = evaluation_background(self._plan, views)
         renders = [renderer(each, self._plan) for each in (scene, CpuEngine(self._coarse))]
         sums = torch.zeros(2, 2, dtype=torch.float64)  # by model, then seams and others
         counts = torch.zeros(2, dtype=torch.float64)
-        for view, seams in zip(views, self._of(views), strict=True):
+        for view, seams in zip(views, self._of(views, step), strict=True):
+            step()
             target = view.full
             used = torch.ones(target.rgb.shape[:2], dtype=torch.bool) if target.mask is None else target.mask
             parts = [used & seams, used & ~seams]
@@ -88,18 +105,19 @@ class Seams:
         ]
         return SeamScore(float(counts[0] / counts.sum().clamp_min(1.0)), *values)
 
-    def _of(self, views: Sequence[TrainingView]) -> Iterator[Tensor]:
+    def _of(self, views: Sequence[TrainingView], step: Callable[[], None]) -> Iterator[Tensor]:
         """For each view bool [H, W]: pixels that the tiles fill, and most of whose light is of no one tile.
 
-        They are found on views reduced as for the parts of photos, of three tiles at a time, so that many tiles need
-        the memory of three.
+        They are found on views reduced as for the parts of photos, of TILES_AT_A_TIME, so that many tiles need no more
+        memory. step: called for each view of these.
         """
         cameras = [reduced(view.full.camera) for view in views]
         largest = [torch.zeros(camera.height, camera.width) for camera in cameras]
         light = [torch.zeros_like(each) for each in largest]
-        for first in range(0, len(self._members), 3):
-            engine = CpuEngine(_with_colors(self._coarse, self._members[first : first + 3]))
+        for first in range(0, len(self._members), TILES_AT_A_TIME):
+            engine = CpuEngine(_with_colors(self._coarse, self._members[first : first + TILES_AT_A_TIME]))
             for index, camera in enumerate(cameras):
+                step()
                 shares, _, _ = engine.forward(
                     torch.as_tensor(camera.viewmat, dtype=torch.float32),
                     torch.as_tensor(camera.K, dtype=torch.float32),

@@ -177,8 +177,8 @@ def _coarse(context: Context, stages: Stages) -> dict[str, Any]:
         clustered=decided.cluster_culling,
         most_kept=statistics_memory(decided.max_memory, photos.size),
     )
-    # LPIPS is measured of the whole scene. Gaussians are added up to a share of the coarse training and a tile together,
-    # but not at the end of the former, so that they have settled when space is divided (decisions: tile-growth).
+    # LPIPS is measured of the whole scene. Gaussians are added up to a share of the coarse training and a tile together
+    # (decisions: tile-growth), but not at the end of the former: they have settled when space is divided.
     growth = min(GROWTH, decided.schedule.densify_until / COARSE_SHARE)
     trained, _ = train_scene(
         job,
