@@ -56,6 +56,7 @@ class Play(job.Nobody):
 
     def __init__(self, at_offer: Callable[[PlanFolder], None] = lambda folder: None, *has: str) -> None:
         self.has, self.offered, self.stores, self.ended = list(has), list[str](), list[str](), 0
+        self.forgotten = list[str]()
         self._at_offer = at_offer
 
     def begin(self, folder: PlanFolder) -> None:
@@ -76,6 +77,9 @@ class Play(job.Nobody):
         if self.has and "tile-1" in folder.states():
             with folder.claimed(self.has.pop()) as run:
                 run_unit(Context(folder, run, lambda event: None, lambda: False))
+
+    def forget(self, outputs: Sequence[Path]) -> None:
+        self.forgotten += [path.name.rpartition("-")[0] for path in outputs]
 
     def end(self) -> None:
         self.ended += 1
@@ -108,7 +112,7 @@ def test_units_are_done_in_order_and_stored_and_those_of_others_are_waited_for(t
     assert outcome.ended == "succeeded"
     assert (others.offered, others.stores, others.ended) == (
         ["tile-1", "tile-2", "seam-1", "seam-2"],
-        ["photos", "cameras", "coarse", "tile-1", "seam-1", "seam-2"],
+        ["photos", "cameras", "cameras", "coarse", "tile-1", "seam-1", "seam-2"],
         1,
     )
     assert [event.state for event in events if isinstance(event, StateEvent)] == [
@@ -176,6 +180,26 @@ def test_features_and_matches_of_others_are_waited_for_and_used(tmp_path: Path, 
     assert waits == [(stage, 2, 2) for stage in (("features",) if failed else ("features", "matching"))]
     assert "features 1 of 2: still_0001.jpg" in {event.note for event in progress}
     assert sum(event.stage == "images" and event.note == "still_0001.jpg" for event in progress) == 1
+    assert others.forgotten == ["features-1", "features-2", "pairs", "matches-1", "matches-2"]
+    units = tmp_path / "run" / "tiles" / "units"
+    assert {path.name.rpartition("-")[0] for path in units.glob("*") if path.is_dir()} == {
+        "photos",
+        "cameras",
+    }
+    # An attempt that ends before it has removed them leaves that to the next one.
+    left = next(units.glob("cameras-*")).with_name(
+        next(units.glob("photos-*")).name.replace("photos", "pairs")
+    )
+    left.mkdir()
+    again = Play()
+    run(tmp_path, again, lambda events: bool(again.forgotten))
+    assert again.forgotten == others.forgotten
+    # With the cameras of another job on the capture, none is looked for.
+    shutil.rmtree(tmp_path / "run" / "tiles")
+    _, events = run(tmp_path, (known := Play()), lambda events: "cameras" in known.stores)
+    told = [(event.unit, event.state) for event in events if isinstance(event, UnitEvent)]
+    assert told == [(unit, state) for unit in ("photos", "cameras") for state in both]
+    assert known.offered == []
 
 
 def test_a_failed_tile_is_said_and_the_scene_is_made_without_it(tmp_path: Path) -> None:
@@ -218,7 +242,7 @@ def test_a_coarse_training_that_was_interrupted_continues(tmp_path: Path) -> Non
 
     others = Play()
     outcome, events = run(tmp_path, others, lambda events: len(measured(events)) >= 3)
-    assert (outcome.ended, others.stores, others.ended) == ("cancelled", ["photos", "cameras"], 1)
+    assert (outcome.ended, others.stores, others.ended) == ("cancelled", ["photos", "cameras", "cameras"], 1)
     before = measured(events)
     outcome, events = run(tmp_path, Play())
     assert outcome.ended == "succeeded"

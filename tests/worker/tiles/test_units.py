@@ -67,6 +67,10 @@ def test_what_only_the_cameras_need_is_not_done_once_they_are_there() -> None:
     assert scene.wanted(dict.fromkeys(("cameras", "coarse"), "done")) == {
         *("photos", "tile-1", "tile-2", "seam-1", "seam-2", "scene")
     }
+    assert scene.needed({"cameras": "done", "coarse": "done"}) == {unit.name for unit in scene.units} - set(
+        scene.camera_names[1:-1]
+    )
+    assert scene.needed({}) == {unit.name for unit in scene.units}
     failed: dict[str, State] = {"photos": "done", "features-1": "failed", "features-2": "done"}
     assert scene.ready(failed) == ["pairs"]
     assert scene.key("cameras", failed) == scene.key("cameras", {})

@@ -67,9 +67,9 @@ class TrainingEvents:
             )
         )
 
-    def evaluating(self, done: int, total: int) -> None:
-        """Emit how many photos the finished scene was compared with."""
-        self._emit_progress("evaluation", done, total, "photos compared with the scene")
+    def evaluating(self, done: int, total: int, note: str = "photos compared with the scene") -> None:
+        """Emit how many photos the finished scene was compared with, or what else was."""
+        self._emit_progress("evaluation", done, total, note)
 
     def writing(self, what: str) -> None:
         """Emit which of the files of the model are written now."""

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from splatmill.schema import MIN_PHOTOS
+from splatmill.schema import MIN_PHOTOS, TrainOptions
 from splatmill.schema.files.photos import ARCHIVE_SUFFIXES, VIDEO_SUFFIXES
 from splatmill_worker.images import prepared_file
 from splatmill_worker.images.prepare import Prepared, given_files
@@ -45,6 +45,17 @@ def stored_photos(photos: Path, capture: Path) -> Prepared | None:
     return prepared_file.load(photos, capture) if (photos / prepared_file.FILE).is_file() else None
 
 
+def has_parts(photos: Path, capture: Path, workdir: Path | None, options: TrainOptions) -> bool:
+    """Whether the units after `photos` have something to do: no cameras are given, or known in `workdir`.
+
+    photos: the output of the unit `photos`.
+    """
+    prepared = stored_photos(photos, capture)
+    if prepared is None or not facts_of(photos)[DIVIDED]:
+        return False
+    return workdir is None or not has_model(prepared, workdir, sfm_options(options))
+
+
 def files_of_block(photos: Path, block: blocks.Block) -> set[str]:
     """The files of the capture, by their names in it, of which the features of a block are found.
 
@@ -64,14 +75,17 @@ def block_of(name: str, parts: int) -> blocks.Block:
     return blocks.Block(int(name.rpartition("-")[2]), parts)
 
 
-def do_part(job: Job, name: str, parts: int, before: Sequence[Path], out: Path) -> dict[str, Any]:
+def do_part(
+    job: Job, name: str, parts: int, before: Sequence[Path], out: Path, known: Path | None
+) -> dict[str, Any]:
     """Do one of the units after `photos`: features and matches of a block, one of `parts`, or the pairs.
 
     before: the outputs of the units that it needs, that of `photos` first.
     out: folder for its own.
+    known: work folder in which the cameras may lie; None without.
     """
     photos, *others = before
-    if job.prepared is None or not facts_of(photos)[DIVIDED]:
+    if job.prepared is None or not has_parts(photos, job.capture, known, job.options):
         return {}
     kind = name.partition("-")[0]
     found, options = job.prepared, sfm_options(job.options)

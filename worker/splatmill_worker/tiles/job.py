@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,11 +30,12 @@ from splatmill_worker.pipeline.job import check_lpips, choose_kernels
 from splatmill_worker.pipeline.live import Looks, Onlookers
 from splatmill_worker.pipeline.stages import Outcome
 from splatmill_worker.sfm.run import SFM
-from splatmill_worker.tiles.folder import TILES, PlanFolder, digest_of, facts_of
+from splatmill_worker.tiles.camera_parts import has_parts
+from splatmill_worker.tiles.folder import TILES, Ended, PlanFolder, digest_of, facts_of
 from splatmill_worker.tiles.remaining import Remaining
 from splatmill_worker.tiles.retrying import may_pass
 from splatmill_worker.tiles.stages import CHECKPOINTS, PLAN_FILE, Context, run_unit
-from splatmill_worker.tiles.units import DIVIDED, ScenePlan
+from splatmill_worker.tiles.units import ScenePlan
 
 WAIT_SECONDS = 1.0
 """Time between two looks for the tiles that other processes do, while nothing is left for this one."""
@@ -103,7 +104,8 @@ class _Work:
     """What all units of a job are done with.
 
     entered: the states that the job has entered.
-    left_out: names of units that have nothing to do.
+    left_out: names of units that have nothing to do, once `photos` has ended.
+    checked: units of which that is known.
     reported: the last state that was emitted of each unit.
     """
 
@@ -115,6 +117,7 @@ class _Work:
     others: Others
     entered: list[JobState] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
+    checked: list[str] = field(default_factory=list)
     reported: dict[str, str] = field(default_factory=dict)
 
     def report(
@@ -160,6 +163,8 @@ def run(
     folder.release()
     folder.forget_failures(*plan.part_names)
     work.others.begin(folder)
+    if "cameras" in folder.states():
+        _forget_features(work)  # an attempt may have ended before it did
     try:
         while "scene" not in folder.states():
             _step(work)
@@ -181,9 +186,7 @@ def _step(work: _Work) -> None:
     folder, others = work.folder, work.others
     ended = folder.ended()
     states = {name: end.state for name, end in ended.items()}
-    photos = ended.get("photos")
-    if photos is not None and photos.path is not None and not facts_of(photos.path)[DIVIDED]:
-        work.left_out[:] = folder.plan.camera_names[1:-1]
+    _check_parts(work, ended)
     for name, end in ended.items():
         work.report(name, end.state, end.path)
     ready = folder.plan.ready(states)
@@ -203,6 +206,17 @@ def _step(work: _Work) -> None:
         _wait(work, tiles)
     elif free not in folder.states():
         _do(work, free)
+
+
+def _check_parts(work: _Work, ended: Mapping[str, Ended]) -> None:
+    """Note which units have nothing to do, once the photos are examined."""
+    photos = ended.get("photos")
+    if photos is None or photos.path is None or "photos" in work.checked:
+        return
+    work.checked.append("photos")
+    plan = work.folder.plan
+    if not has_parts(photos.path, work.folder.capture, work.workdir, plan.options):
+        work.left_out.extend(plan.camera_names[1:-1])
 
 
 def _do(work: _Work, name: str) -> None:
@@ -245,6 +259,7 @@ def _do(work: _Work, name: str) -> None:
             # Where the service looks for cameras that other jobs on the capture can use; given ones have none.
             shutil.copytree(run.path / SFM, work.workdir / SFM, copy_function=_link, dirs_exist_ok=True)
         _forget_features(work)
+        work.others.stored(run.path)  # for which there may have been no room before
     elif name == "coarse":
         shutil.rmtree(work.workdir / CHECKPOINTS, ignore_errors=True)
         work.workdir.joinpath(PLAN_FILE).unlink(missing_ok=True)
@@ -257,12 +272,15 @@ def _do(work: _Work, name: str) -> None:
 
 def _forget_features(work: _Work) -> None:
     """Remove what only the cameras needed: features of 1,000 photos and their matches take 0.2 GB or more."""
-    ended = work.folder.ended()
-    names = [name for name in work.folder.plan.camera_names[1:-1] if name in ended]
-    outputs = [path for name in names if (path := ended[name].path) is not None]
-    work.others.forget([path for path in outputs if path.name.rpartition("-")[0] not in work.left_out])
+    folder = work.folder
+    outputs = [folder.output(name) for name in folder.plan.camera_names[1:-1]]
+    if not work.left_out:
+        work.others.forget(outputs)
     for path in outputs:
-        shutil.rmtree(path)
+        if path.is_dir():
+            part = path.with_name(f".{path.name}.part")  # which the next attempt removes
+            path.rename(part)
+            shutil.rmtree(part)
 
 
 def _wait(work: _Work, parts: Sequence[str]) -> None:

@@ -142,12 +142,12 @@ def _stated(joining: Joining) -> Plan:
         f"The scene is trained in {count} tiles, after a coarse model of {joining.coarse.gaussians.count} Gaussians. "
         f"All tiles together may have about {joining.coarse.most}."
     )
-    return replace(
-        plan,
-        max_gaussians=joining.coarse.most,
-        kernels=joining.job.kernels,
-        reasons={**plan.reasons, "max_gaussians": because},
-    )
+    reasons = {**plan.reasons, "max_gaussians": because}
+    if "growth" in reasons:
+        growth = "The photos differ in their light, which late Gaussians would learn: tiles add "
+        growth += "none." if not joining.coarse.limited else "some, as a limit stopped the coarse training."
+        reasons["growth"] = growth
+    return replace(plan, max_gaussians=joining.coarse.most, kernels=joining.job.kernels, reasons=reasons)
 
 
 def _trained(joining: Joining, engine: Engine, events: TrainingEvents) -> Trained:
@@ -207,4 +207,7 @@ def _seams(coarse: Coarse, engine: Engine, events: TrainingEvents) -> dict[str, 
     near = ~coarse.far
     members: list[Tensor] = [torch.from_numpy(cell.holds(means)) & near for cell in coarse.cells]
     seams = Seams(coarse.gaussians, members, coarse.plan)
-    return asdict(seams.measured(engine, coarse.held_out, events.evaluating))
+    note = "views compared where tiles meet"
+    return asdict(
+        seams.measured(engine, coarse.held_out, lambda done, total: events.evaluating(done, total, note))
+    )

@@ -135,7 +135,9 @@ def _before_cameras(context: Context) -> dict[str, Any]:
     out.mkdir()
     if name == "photos":
         return camera_parts.examine_photos(job, out)
-    return camera_parts.do_part(job, name, plan.blocks, context.outputs(*plan.unit(name).needs), out)
+    known = None if context.known is None else context.known.parent
+    before = context.outputs(*plan.unit(name).needs)
+    return camera_parts.do_part(job, name, plan.blocks, before, out, known)
 
 
 def _cameras(context: Context, stages: Stages) -> dict[str, Any]:

@@ -162,9 +162,10 @@ def tile_plan(coarse: Coarse, free: int, photos: int, *, last: bool = False) -> 
     of the rates, MANY_VISITS over that number: what so many steps learn at high rates is rather the photos than the
     scene (decisions: tile-rates).
 
-    Gaussians are added up to the share of both trainings at which one piece adds the last: later ones learn what single
-    photos show. A tile of fewer than some hundred steps adds none by then. Where a limit stopped the coarse training
-    from adding more, they are added up to that share of the tile's own steps (decisions: tile-growth).
+    Gaussians are added up to the share of both trainings after which one piece adds none: later ones learn what single
+    photos show. A tile of fewer than some hundred steps adds none by then, and none does where that share ends with the
+    coarse training. Where a limit stopped the coarse training from adding more, they are added up to that share of the
+    tile's own steps (decisions: tile-growth).
     """
     plan, schedule = coarse.plan, coarse.plan.schedule
     until, boost = 1.0 - LAST, schedule.annealing.boost

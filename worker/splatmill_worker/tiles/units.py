@@ -170,6 +170,11 @@ class ScenePlan:
                 left += self.unit(name).needs
         return found
 
+    def needed(self, states: Mapping[str, State]) -> set[str]:
+        """The units that the scene still needs, and those that they read."""
+        wanted = self.wanted(states)
+        return wanted.union(need for name in wanted for need in self.unit(name).needs)
+
     def missing(self, name: str, states: Mapping[str, State]) -> list[str]:
         """The units that must end before the unit `name` can be run."""
         unit = self.unit(name)

@@ -124,6 +124,37 @@ def test_without_room_for_copies_no_tile_is_offered_and_nothing_more_is_stored(
     assert "of 2.0 kB in storage" in warning
 
 
+def test_once_there_is_room_again_parts_are_offered_again(
+    local: Storage, connection: redis.Redis, others: OtherWorkers, plan: PlanFolder
+) -> None:
+    with plan.claimed("features-1") as run:
+        run.out.mkdir()
+        run.out.joinpath("a").write_bytes(bytes(3_500))
+        run.publish({})
+    reservations.note_limit(connection, "default", 5_000)
+    others.begin(plan)
+    assert set(stored(local)) == {"features-1", "cameras"}, "the coarse model does not fit"
+    others.offer(["tile-1"])
+    assert waiting(connection) == 0
+    others.forget([plan.output("features-1")])
+    others.stored(plan.output("coarse"))
+    others.offer(["tile-1"])
+    assert set(stored(local)) == {"cameras", "coarse"}
+    assert waiting(connection) == 1
+
+
+def test_another_machine_fetches_what_is_needed_yet(
+    local: Storage, others: OtherWorkers, plan: PlanFolder, tmp_path: Path
+) -> None:
+    with plan.claimed("features-1") as run:
+        run.publish({})
+    others.begin(plan)
+    fresh = PlanFolder(tmp_path / "fresh", plan.plan)
+    others.begin(fresh)
+    assert set(fresh.states()) == {"cameras", "coarse"}
+    assert set(stored(local)) == {"features-1", "cameras", "coarse"}
+
+
 def test_where_room_ends_tiles_that_nobody_has_begun_are_taken_back_and_those_of_others_are_counted(
     local: Storage,
     connection: redis.Redis,

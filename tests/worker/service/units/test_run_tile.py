@@ -194,5 +194,11 @@ def test_features_and_matches_are_found_on_another_machine_with_the_photos_of_th
     assert database("matches-1").relative_to(made.output("matches-1")) == database("features-2").relative_to(
         made.output("features-2")
     )
+    with made.claimed("cameras") as run:  # that these small photos do not have
+        run.publish({})
+    units.put(made.output("cameras"))
+    units.drop([made.output("features-2").name])
+    elsewhere("features-2")  # whose entry the queue has given once more
+    assert not units.has(made.output("features-2").name)
     both = [facts_of(database(name).parents[3])["pairs"] for name in ("matches-1", "matches-2")]
     assert both == [5, 5], "of ten pairs"

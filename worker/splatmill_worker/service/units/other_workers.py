@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -47,6 +47,7 @@ class OtherWorkers:
         self._numbers = {name: number for number, name in enumerate(folder.plan.part_names, 1)}
         self._units.put_plan(folder.plan)
         self._units.drop_others(folder)
+        self._bring(folder, ("cameras",))
         self.gather(folder)
         for ended in folder.ended().values():
             if ended.path is not None:
@@ -78,20 +79,24 @@ class OtherWorkers:
 
     def gather(self, folder: PlanFolder) -> None:
         """Bring the outputs of others into the folder of the plan, and count them for the owner of the job."""
-        brought = dict(self._units.bring(folder, check=self._job_folder.check_space))
-        if brought:
-            self._room.store(brought, may_refuse=False)
+        self._bring(folder, folder.plan.needed(folder.states()))
 
     def forget(self, outputs: Sequence[Path]) -> None:
         """Delete outputs from storage. Their room in the owner's quota is for what the job stores next."""
         dropped = self._units.drop([path.name for path in outputs])
         if dropped:
             self._room.store(dict.fromkeys(dropped, 0), may_refuse=False)
+            self._alone = False  # until copies do not fit again
 
     def end(self) -> None:
         """Take all tiles out of the queue that no worker has begun."""
         for tile in sorted(self._offered):
             patiently(partial(self._on, queue.take_back_tile, tile))
+
+    def _bring(self, folder: PlanFolder, only: Collection[str]) -> None:
+        brought = dict(self._units.bring(folder, only, self._job_folder.check_space))
+        if brought:
+            self._room.store(brought, may_refuse=False)
 
     def _on(self, act: Callable[[redis.Redis, str, int, int], bool], name: str) -> bool:
         return act(self._connection, self._job_id, self._generation, self._numbers[name])

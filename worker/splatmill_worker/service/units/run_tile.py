@@ -99,6 +99,8 @@ def _train(entry: TileEntry, row: JobRow, stopped: Callable[[], bool]) -> None:
         folder.run.mkdir(parents=True, exist_ok=True)
         tiles = PlanFolder(folder.run, plan)
         tiles.release()
+        if _is_unneeded(units, tiles, name):
+            return
         units.bring(tiles, only=(*plan.unit(name).needs, name), check=folder.check_space)
         if name in tiles.states() or tiles.plan.missing(name, tiles.states()):
             return
@@ -116,9 +118,15 @@ def _train(entry: TileEntry, row: JobRow, stopped: Callable[[], bool]) -> None:
             decoders.confined([folder.path], run.work / ENDED, stopped),
         ):
             run_unit(Context(tiles, run, lambda event: None, stopped))
-        units.put(run.path)
+        if not _is_unneeded(units, tiles, name):
+            units.put(run.path)
     finally:
         folder.close()
+
+
+def _is_unneeded(units: StoredUnits, tiles: PlanFolder, name: str) -> bool:
+    """Whether the unit is one of those that only the cameras need, and these are there."""
+    return name in tiles.plan.camera_names and units.has(tiles.output("cameras").name)
 
 
 def _row_or_exit(entry: TileEntry) -> JobRow:

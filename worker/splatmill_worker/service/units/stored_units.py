@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 
 from splatmill import __version__
@@ -54,9 +54,13 @@ class StoredUnits:
         files = [*(path for path in sorted(output.rglob("*")) if path.is_file() and path != last), last]
         names = [path.relative_to(output).as_posix() for path in files]
         room({f"{output.name}/{name}": path.stat().st_size for path, name in zip(files, names, strict=True)})
-        if not self._storage.exists(f"{target}/{DONE}"):
+        if not self.has(output.name):
             for path, name in zip(files, names, strict=True):
                 self._storage.put(f"{target}/{name}", path)
+
+    def has(self, output: str) -> bool:
+        """Whether the output is stored whole. output: name of its folder."""
+        return self._storage.exists(f"{self._prefix}/{output}/{DONE}")
 
     def drop(self, outputs: Sequence[str]) -> list[str]:
         """Delete outputs, the last file of each first. Return the names of their files.
@@ -86,7 +90,7 @@ class StoredUnits:
     def bring(
         self,
         folder: PlanFolder,
-        only: Sequence[str] | None = None,
+        only: Collection[str] | None = None,
         check: Callable[[Mapping[Path, Entry]], None] = lambda wanted: None,
     ) -> list[tuple[str, int]]:
         """Copy the outputs that the folder of the plan lacks into it. Return the names and sizes of their files.
@@ -110,6 +114,8 @@ class StoredUnits:
             copies = {part / name: entry for name, entry in files.items()}
             check(copies)
             staging.fetch(self._storage, copies)
-            part.rename(folder.root / UNITS / output)
+            target = folder.root / UNITS / output
+            shutil.rmtree(target, ignore_errors=True)  # a part of one that was being removed
+            part.rename(target)
             brought += [(f"{output}/{name}", entry.size) for name, entry in files.items()]
         return brought
