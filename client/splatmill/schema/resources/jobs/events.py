@@ -143,8 +143,8 @@ class SnapshotEvent(Response):
 
 
 class UnitEvent(Response):
-    """A unit of a scene in tiles began or ended: a part of the search for cameras, these, the coarse model, a tile or its
-    last steps, or the whole."""
+    """A unit of a scene in tiles began or ended: a part of the search for cameras, the cameras, the coarse model, a
+    tile or its last steps, or the whole."""
 
     type: Literal["unit"] = "unit"
     unit: str = Field(
