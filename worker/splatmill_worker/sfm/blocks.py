@@ -2,8 +2,8 @@
 of pairs of photos, and the matches of a block of pairs.
 
 Each leaves a COLMAP database, or the scores beside it, in the folder in which `reconstruct_photos` would have it.
-`merge` brings them together there, and what there is is not found anew. They are those of the first effort: a higher
-one, where it is tried, is left to `reconstruct_photos`.
+`merge` brings them together there, and `reconstruct_photos` finds only what is missing. They are those of the first
+effort: a higher one, where it is tried, is left to `reconstruct_photos`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from splatmill_worker.sfm.callbacks import OnProgress, stop_if
 from splatmill_worker.sfm.effort import SCORES, database_of, find_features, match, select_pairs
 from splatmill_worker.sfm.features import FEATURES, completed, merge_databases, photos_in
 from splatmill_worker.sfm.options import SfmOptions
-from splatmill_worker.sfm.run import SFM, EffortResult, opened
+from splatmill_worker.sfm.run import SFM, EffortResult, SfmRun, opened
 from splatmill_worker.sfm.solve import efforts
 
 MERGING = "blocks brought together"
@@ -57,8 +57,7 @@ def find_block(
         on_progress(stage, done - others, total - others, note)
 
     with opened(prepared, workdir, options, report, cancelled) as run:
-        effort = efforts(options, run.count)[0]
-        result = EffortResult(effort, database_of(run, effort))
+        result = _first_effort(run)
         find_features(run, result, photos)
         completed(result.database, photos)
     return len(photos)
@@ -78,8 +77,7 @@ def score_pairs(
     """
     merge(before, workdir, _merging("features", on_progress), cancelled)
     with opened(prepared, workdir, options, on_progress, cancelled) as run:
-        effort = efforts(options, run.count)[0]
-        result = EffortResult(effort, database_of(run, effort))
+        result = _first_effort(run)
         known = photos_in(result.database, with_features=True) if result.database.is_file() else set()
         find_features(run, result)
         chosen = select_pairs(run, result)
@@ -104,8 +102,7 @@ def match_block(
     """
     merge(before, workdir, _merging("pairs", on_progress), cancelled, without=FEATURES)
     with opened(prepared, workdir, options, on_progress, cancelled) as run:
-        effort = efforts(options, run.count)[0]
-        result = EffortResult(effort, database_of(run, effort))
+        result = _first_effort(run)
         chosen = sorted(select_pairs(run, result))  # by the scores, without any features
         own = {chosen[index] for index in block.of(len(chosen))}
         photos = {index for pair in own for index in pair}
@@ -121,6 +118,12 @@ def match_block(
         result.database.with_name(SCORES).unlink(missing_ok=True)
         completed(result.database, ())
     return len(own)
+
+
+def _first_effort(run: SfmRun) -> EffortResult:
+    """The effort that is tried first, before it has found anything."""
+    effort = efforts(run.options, run.count)[0]
+    return EffortResult(effort, database_of(run, effort))
 
 
 def _merging(stage: str, on_progress: OnProgress) -> Callable[[int, int], None]:

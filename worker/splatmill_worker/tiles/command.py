@@ -180,10 +180,7 @@ def _do_one(root: Path, name: str, stopped: _StopSignals, begun: int | None, *, 
 
             try:
                 context = Context(folder, run, _Lines(name), lambda: stopped.asked or not run.held())
-                readable = [
-                    folder.capture.resolve(),
-                    *(path.resolve() for path in (run.path.parent, run.work)),
-                ]
+                readable = [path.resolve() for path in (folder.capture, run.path.parent, run.work)]
                 with decoders.confined(readable, run.work / ENDED, context.cancelled):
                     run_unit(context)
             except Exception as error:

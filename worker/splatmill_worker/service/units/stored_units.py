@@ -71,9 +71,7 @@ class StoredUnits:
         for output in outputs:
             folder = f"{self._prefix}/{output}"
             entries = [entry.path for entry in self._storage.entries(folder)]
-            self._storage.delete(
-                f"{folder}/{DONE}"
-            )  # what is left of it is being stored, for all that others know
+            self._storage.delete(f"{folder}/{DONE}")  # without it, others take the rest for no output
             self._storage.delete_prefix(folder)
             dropped += [path.removeprefix(f"{self._prefix}/") for path in entries]
         return dropped
