@@ -8,6 +8,9 @@ import signal
 import socket
 import subprocess
 import sys
+import time
+from contextlib import closing
+from http.client import HTTPConnection
 from pathlib import Path
 
 import httpx
@@ -223,3 +226,16 @@ def test_other_users_of_the_machine_may_read_nothing_of_it(own_service: Up) -> N
     found = [own_service.data, *own_service.data.rglob("*")]
     assert {path.stat().st_mode & 0o077 for path in found} == {0}
     assert sorted(path.name for path in found if path.is_socket()) == ["redis.sock", "renderer.sock"]
+
+
+def test_connections_that_rest_are_kept_longer_than_clients_use_them(service: Up) -> None:
+    # httpx leaves a connection that has rested for 5 seconds; a server that closes it then fails some of its requests.
+    api, renderer = HTTPConnection("127.0.0.1", service.http.base_url.port), HTTPConnection("renderer")
+    with closing(api), closing(renderer):
+        renderer.sock = socket.socket(socket.AF_UNIX)
+        renderer.sock.connect(str(service.data / "renderer.sock"))
+        for rest in (8, 0):
+            for connection in (api, renderer):
+                connection.request("GET", "/healthz")
+                assert connection.getresponse().read()
+            time.sleep(rest)

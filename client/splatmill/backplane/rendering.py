@@ -18,6 +18,12 @@ HEALTH = "/healthz"
 CLIENT_HEADER = "Splatmill-Client"
 """Header of a request to the renderer: whose it is, as `client_of` writes it."""
 
+IDLE_TIMEOUT = 130
+"""Seconds after which the renderer and the API close a connection without requests.
+
+Clients must close theirs first: a request on a connection that is just being closed fails. httpx does so after
+5 seconds, nginx after 60 and Caddy after 120.
+"""
 
 REQUEST_HEADER = "X-Request-ID"
 """Header of a request to the renderer: the id of the client's request, for the log."""

@@ -1,10 +1,11 @@
-"""The certificate of a server that answers over HTTPS by itself."""
+"""How long the API keeps idle connections, and the certificate of a server that answers over HTTPS by itself."""
 
 import hashlib
 import ssl
 from pathlib import Path
 from typing import Any
 
+from splatmill.backplane.rendering import IDLE_TIMEOUT
 from splatmill_server.base.settings import Settings
 
 
@@ -15,12 +16,13 @@ def fingerprint(certificate: Path) -> str:
 
 
 def uvicorn_options(settings: Settings) -> dict[str, Any]:
-    """Return the options with which uvicorn answers over HTTPS, or none where the settings name no certificate.
+    """Return the options of uvicorn for connections: when idle ones are closed, and the certificate, if any is named.
 
     Raises OSError if the certificate or its key cannot be used.
     """
+    options: dict[str, Any] = {"timeout_keep_alive": IDLE_TIMEOUT}
     if settings.tls_certificate is None:
-        return {}
+        return options
     try:
         ssl.create_default_context(ssl.Purpose.CLIENT_AUTH).load_cert_chain(
             settings.tls_certificate, settings.tls_key, lambda: ""
@@ -30,4 +32,4 @@ def uvicorn_options(settings: Settings) -> dict[str, Any]:
             f"SPLATMILL_TLS_CERTIFICATE={settings.tls_certificate} cannot be used: {error}. Name a certificate in PEM, "
             "and its private key without a password in SPLATMILL_TLS_KEY."
         ) from error
-    return {"ssl_certfile": settings.tls_certificate, "ssl_keyfile": settings.tls_key}
+    return options | {"ssl_certfile": settings.tls_certificate, "ssl_keyfile": settings.tls_key}

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import uvicorn
 
-from splatmill.backplane import log_lines
+from splatmill.backplane import log_lines, rendering
 from splatmill.backplane.private_files import listen
 from splatmill.backplane.storage.storage import Storage, StorageError
 from splatmill.schema import parse_bytes
@@ -45,6 +45,7 @@ def serve(host: str, port: int, uds: Path | None, fd: int | None = None, backend
         log_level="warning",
         access_log=False,
         timeout_graceful_shutdown=2,
+        timeout_keep_alive=rendering.IDLE_TIMEOUT,
         lifespan="off",
     )
     server = uvicorn.Server(config)
