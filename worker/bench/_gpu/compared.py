@@ -116,7 +116,7 @@ def _ours(capture: Path, size: int, seconds: float, seed: int) -> Iterator[Row]:
     speed = probe(open_engine(first, "gpu"), views)
     card = device.describe()
     assert card is not None
-    measured = measure(world, views, len(held_out), speed)
+    measured, _ = measure(world, views, len(held_out), speed)
     facts = replace(measured, memory_available=card.free_bytes)
     plan = decide(facts, TrainOptions(image_size=size, seed=seed, time_budget=seconds), "gpu")
     done = train(open_engine(first, "gpu"), views, held_out, plan, extent=EXTENT)

@@ -20,7 +20,7 @@ from splatmill_worker.splat.start.frusta import RANDOM_GAUSSIANS, sample_frusta
 from splatmill_worker.splat.start.given_model import LEAST_ASSESSED, GivenModel, assess, read_given_model
 from splatmill_worker.splat.start.hull import Hull, NoHull, at_first, visual_hull
 from splatmill_worker.splat.start.points import ENOUGH_POINTS, from_points
-from splatmill_worker.splat.start.seeding import add_seeds
+from splatmill_worker.splat.start.seeding import Seeds, add_seeds
 
 
 @dataclass(frozen=True)
@@ -84,8 +84,13 @@ def _doubt_message(start: GivenModel) -> str:
     )
 
 
-def seeded(job: Job, first: First, cameras: Cameras, photos: Photos, plan: Plan) -> Gaussians:
-    """The first Gaussians within the plan's limit, with what the plan adds to those made from points."""
+def seeded(
+    job: Job, first: First, cameras: Cameras, photos: Photos, plan: Plan, seeds: Seeds | None
+) -> Gaussians:
+    """The first Gaussians within the plan's limit, with what the plan adds to those made from points.
+
+    seeds: those of `photos`; None: they are found where the plan adds them.
+    """
     tell = photos.reporter(job.emit)
     tell("placing the first Gaussians")
     if isinstance(first.hull, Hull):
@@ -102,6 +107,7 @@ def seeded(job: Job, first: First, cameras: Cameras, photos: Photos, plan: Plan)
         fill_gaps=plan.gaps,
         add_far_shell=plan.far_shell,
         max_gaussians=plan.max_gaussians,
+        seeds=seeds,
         tell=tell,
     )
 

@@ -23,6 +23,7 @@ from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.plan.plan_file import read_plan, write_plan
 from splatmill_worker.splat.plan.probe import probe
 from splatmill_worker.splat.start.hull import Hull
+from splatmill_worker.splat.start.seeding import Seeds
 
 Revise = Callable[[Plan], Plan]
 
@@ -36,6 +37,7 @@ class Planned:
     plan: what was decided.
     photos: at the size of the plan, and in the light that it decides on; None where they are to be loaded smaller.
     room: for them.
+    seeds: what may be added to the first Gaussians, by `photos`; None where it was not found by these.
     """
 
     first: First
@@ -43,6 +45,7 @@ class Planned:
     plan: Plan
     photos: Photos | None
     room: Room
+    seeds: Seeds | None
 
 
 def plan_training(job: Job, cameras: Cameras, revise: Revise, stages: Stages) -> Planned:
@@ -56,14 +59,15 @@ def plan_training(job: Job, cameras: Cameras, revise: Revise, stages: Stages) ->
         photos = load_photos(cameras, loading_size(job.options, job.kernels), room, job.emit)
     with stages.measured("plan"):
         first = first_gaussians(job, cameras, photos)
-        facts = _measure_facts(job, cameras, photos, first)
+        facts, seeds = _measure_facts(job, cameras, photos, first)
         if job.options.within is not None:
             facts = replace(facts, seconds_left=job.options.within - stages.elapsed)
         plan = _make_plan(job, facts, revise)
         if (late := overrun(facts, plan)) is not None:
             job.warn(late)
     smaller = plan.image_size < max(facts.width, facts.height)
-    return Planned(first, facts, plan, None if smaller else _in_light(photos, facts, plan), room)
+    trained = None if smaller else _in_light(photos, facts, plan)
+    return Planned(first, facts, plan, trained, room, seeds if trained is photos else None)
 
 
 def overrun(facts: Facts, plan: Plan) -> str | None:
@@ -95,12 +99,14 @@ def _in_light(photos: Photos, facts: Facts, plan: Plan) -> Photos:
     return photos.relit(facts.light) if plan.exposure and facts.light is not None else photos
 
 
-def _measure_facts(job: Job, cameras: Cameras, photos: Photos, first: First) -> Facts:
-    """What can be measured before training: the scene, its photos, and how fast this machine trains it."""
+def _measure_facts(job: Job, cameras: Cameras, photos: Photos, first: First) -> tuple[Facts, Seeds | None]:
+    """What can be measured before training: the scene, its photos, and how fast this machine trains it; and seeds."""
     pixels = photos.training[0].full.rgb[..., 0].numel()
     most = resolved(pixels, len(photos.training)) if first.model is None else 0
     speed = probe(open_engine(first.gaussians, job.kernels), photos.training, most=most)
-    facts = measure(cameras.world, photos.training, len(photos.held_out), speed, photos.reporter(job.emit))
+    facts, seeds = measure(
+        cameras.world, photos.training, len(photos.held_out), speed, photos.reporter(job.emit)
+    )
     facts = replace(facts, start=first.model, photo_bytes=photos.size, photos_on_disk=photos.on_disk)
     if isinstance(first.hull, Hull):
         facts = replace(facts, hull_points=len(first.hull.points))
@@ -109,7 +115,7 @@ def _measure_facts(job: Job, cameras: Cameras, photos: Photos, first: First) -> 
     if job.options.lpips is not Switch.off:
         facts = replace(facts, no_lpips=lpips_weights.absence())
     card = describe() if job.kernels == "gpu" else None
-    return facts if card is None else replace(facts, memory_available=card.free_bytes)
+    return facts if card is None else replace(facts, memory_available=card.free_bytes), seeds
 
 
 def _make_plan(job: Job, facts: Facts, revise: Revise) -> Plan:

@@ -79,7 +79,7 @@ def run(
         emit(PlanEvent(plan=planned.plan.as_dict()))
         photos = planned_photos(job, cameras, planned, stages)
         plan = planned.plan
-        first = seeded(job, planned.first, cameras, photos, plan)
+        first = seeded(job, planned.first, cameras, photos, plan, planned.seeds)
         engine = open_engine(
             first,
             plan.kernels,

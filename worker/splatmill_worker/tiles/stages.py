@@ -174,7 +174,7 @@ def _coarse(context: Context, stages: Stages) -> dict[str, Any]:
     context.emit(PlanEvent(plan=decided.as_dict()))
     photos = planned_photos(job, cameras, planned, stages)
     engine = open_engine(
-        seeded(job, planned.first, cameras, photos, decided),
+        seeded(job, planned.first, cameras, photos, decided, planned.seeds),
         decided.kernels,
         clustered=decided.cluster_culling,
         most_kept=statistics_memory(decided.max_memory, photos.size),

@@ -44,12 +44,20 @@ def depths(bare: Scene) -> list[np.ndarray]:
     return [synthetic.photograph(still, view.camera, samples=1)[1] for view in bare.views]
 
 
-def depth_errors(scene: Scene, points: np.ndarray, seen: np.ndarray, depths: list[np.ndarray]) -> np.ndarray:
+def shows(found: stereo.StereoPoints, views: int) -> np.ndarray:
+    """Which of so many views show each point, bool [n,views]."""
+    table = np.zeros((len(found.points), views), bool)
+    table[np.repeat(np.arange(len(table)), np.diff(found.offsets)), found.views] = True
+    return table
+
+
+def depth_errors(scene: Scene, found: stereo.StereoPoints, depths: list[np.ndarray]) -> np.ndarray:
     """Relative depth error of each point in the first view that saw it; the nearest true depth of 3 x 3 pixels."""
     errors = []
+    seen = shows(found, len(scene.views))
     for index, view in enumerate(scene.views):
         own = seen[:, index] & ~seen[:, :index].any(axis=1)
-        x, y, z, _ = view.camera.project(points[own])
+        x, y, z, _ = view.camera.project(found.points[own])
         depth = depths[index]
         rows = np.clip(y.astype(int)[:, None] + np.repeat([-1, 0, 1], 3), 0, HEIGHT - 1)
         columns = np.clip(x.astype(int)[:, None] + np.tile([-1, 0, 1], 3), 0, WIDTH - 1)
@@ -62,18 +70,18 @@ def test_points_are_found_on_the_surfaces_without_any_to_begin_with(
 ) -> None:
     assert not added.given_up
     assert len(added.points) > 500
-    errors = depth_errors(bare, added.points, added.seen, depths)
+    errors = depth_errors(bare, added, depths)
     # A pixel between views 9 degrees apart is 1/300/tan(9) = 2 per cent of the depth; half of that is usual.
     assert np.median(errors) < 0.01
     assert np.mean(errors < 0.03) > 0.9
-    assert (added.seen.sum(axis=1) >= 3).all()  # the photo itself and two that agree
+    assert np.diff(added.offsets).min() >= 3  # the photo itself and two that agree
     assert added.errors.min() >= 0.0
     assert added.errors.max() <= 1.0
 
 
 def test_colours_are_those_of_the_photos(bare: Scene, added: stereo.StereoPoints) -> None:
     camera = bare.views[0].camera
-    own = np.flatnonzero(added.seen[:, 0])
+    own = np.flatnonzero(shows(added, len(bare.views))[:, 0])
     x, y, _, inside = camera.project(added.points[own])
     photo = np.asarray(Image.open(bare.views[0].image)).astype(float)
     there = photo[y[inside].astype(int), x[inside].astype(int)]
@@ -81,12 +89,14 @@ def test_colours_are_those_of_the_photos(bare: Scene, added: stereo.StereoPoints
 
 
 def test_known_points_stay_and_empty_places_are_filled(bare: Scene, added: stereo.StereoPoints) -> None:
+    seen = shows(added, len(bare.views))[::3]
     few = replace(
         added,
         points=added.points[::3],
         colors=added.colors[::3],
         errors=added.errors[::3],
-        seen=added.seen[::3],
+        views=np.nonzero(seen)[1].astype(np.int32),
+        offsets=np.concatenate([[0], np.cumsum(seen.sum(axis=1))]),
     )
     first = stereo.add(bare, few)
     more = stereo.find_points(first)
@@ -107,7 +117,7 @@ def test_masked_places_get_no_points(bare: Scene, tmp_path: Path) -> None:
     Image.fromarray(mask).save(tmp_path / "mask.png")
     views = [replace(view, mask=tmp_path / "mask.png") for view in bare.views[:3]]
     grey = [GreyView.of(photo) for photo in load_views(views, WIDTH)]
-    found = sweep(1, grey[1], [(0, grey[0]), (2, grey[2])], bare.points, 3, 1.5, 12.0)
+    found = sweep(grey[1], [grey[0], grey[2]], grey[1].camera.project(bare.points), 1.5, 12.0)
     assert found.tried > 50
     assert len(found.points) > 20
     assert grey[1].camera.project(found.points).columns.min() >= WIDTH // 2
@@ -167,10 +177,10 @@ def test_photos_held_out_by_the_data_set_take_no_part(
     )
     found = stereo.find_points(replace(bare, views=views))
     assert len(found.points) > 300
-    assert found.seen.shape == (len(found.points), len(views))
-    assert not found.seen[:, tests].any()
-    assert found.seen[:, 1].any()
-    assert np.median(depth_errors(bare, found.points, found.seen, depths)) < 0.01
+    seen = shows(found, len(views))
+    assert not seen[:, tests].any()
+    assert seen[:, 1].any()
+    assert np.median(depth_errors(bare, found, depths)) < 0.01
 
 
 def test_without_tracks_of_its_own_points_a_scene_gets_none(bare: Scene, added: stereo.StereoPoints) -> None:

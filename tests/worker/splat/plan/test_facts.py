@@ -23,7 +23,7 @@ from tests.support.training import sparse_scene
 
 def facts(world: Scene, views: list[TrainingView], held_out: int = 0) -> SimpleNamespace:
     """The facts as the report has them."""
-    return SimpleNamespace(**measure(world, views, held_out, None).as_dict())
+    return SimpleNamespace(**measure(world, views, held_out, None)[0].as_dict())
 
 
 def darkened(views: list[TrainingView], gains: tuple[float, float, float]) -> None:

@@ -145,7 +145,7 @@ def test_a_photo_that_shows_too_little_keeps_its_light() -> None:
 
 
 def test_without_tracks_light_cannot_be_compared() -> None:
-    assert measure(still_life.scene(), still_life.training_views(), 0, None).light is None
+    assert measure(still_life.scene(), still_life.training_views(), 0, None)[0].light is None
 
 
 def test_a_photo_is_brought_to_other_light_and_clipped_values_count_no_more() -> None:

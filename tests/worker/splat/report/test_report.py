@@ -58,7 +58,7 @@ def report_of(
 ) -> dict[str, Any]:
     scene = replace(still_life.scene(), left_out=left_out, facts=said or {})
     views = still_life.training_views()
-    measured = facts.measure(scene, views, 0, None)
+    measured, _ = facts.measure(scene, views, 0, None)
     held_out = views[:1] if result.held_out is not None else []
     world = ExportWorld(Normalization(1.0, np.zeros(3)), np.array([100.0, 0.0, 0.0]))
     report = write_report(

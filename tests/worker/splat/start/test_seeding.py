@@ -30,6 +30,16 @@ def test_what_is_added_keeps_to_the_limit_and_to_what_the_plan_says() -> None:
     assert parts == ["filling gaps between the points"]
     assert whole.count == first.count + wanted
     assert bool(whole.finite().all())
+    cells = cells_of(world, views)
+    seeds = seeding.Seeds(far_shell.shell_points(cells, world.points), gaps.gap_points(cells))
+    both = [
+        seeding.add_seeds(
+            first, world, photos, seeds=known, fill_gaps=True, add_far_shell=True, max_gaussians=10**6
+        )
+        for photos, known in ((views, None), ([], seeds))
+    ]
+    for name, value in both[0].parameters().items():
+        assert torch.equal(value, both[1].parameters()[name])
     most = first.count + 10
     limited = seeding.add_seeds(first, world, views, fill_gaps=True, add_far_shell=True, max_gaussians=most)
     assert limited.count == most

@@ -8,9 +8,10 @@ from __future__ import annotations
 import math
 
 import pytest
+import torch
 
 from splatmill_worker.errors import FailureName, TrainingFailed
-from splatmill_worker.splat.train.health import EMPTY_STEPS, GRACE_STEPS, LossHealth
+from splatmill_worker.splat.train.health import EMPTY_STEPS, GRACE_STEPS, LossHealth, not_finite
 
 
 def watched(health: LossHealth, first: int, losses: list[float], visible: int = 1) -> LossHealth:
@@ -55,3 +56,10 @@ def test_photos_without_any_gaussian_in_a_row_mean_an_empty_scene() -> None:
     with pytest.raises(TrainingFailed) as failed:
         health.check(2 * EMPTY_STEPS, 0.1, 0)
     assert failed.value.name is FailureName.empty_scene
+
+
+def test_values_that_are_not_finite_are_counted_also_where_a_sum_overflows() -> None:
+    most = torch.finfo(torch.float32).max
+    assert not_finite(torch.full((1000, 3), most)) == 0
+    assert not_finite(torch.zeros(0, 3)) == 0
+    assert not_finite(torch.tensor([[1.0, math.inf, 2.0], [math.nan, -math.inf, most]])) == 3

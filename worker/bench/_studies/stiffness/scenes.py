@@ -86,7 +86,7 @@ def planned(
     """
     options = TrainOptions(image_size=small.longest, steps=steps, max_gaussians=most)
     first = _first(small, seed)
-    facts = measure(small.world, small.training, len(small.held_out), None)
+    facts, seeds = measure(small.world, small.training, len(small.held_out), None)
     plan = replace(revised(decide(facts, options, "cpu"), changes), seed=seed)
     gaussians = first.most_opaque(plan.max_gaussians)
     if plan.initial == "points":
@@ -97,6 +97,7 @@ def planned(
             fill_gaps=plan.gaps,
             add_far_shell=plan.far_shell,
             max_gaussians=plan.max_gaussians,
+            seeds=seeds,
         )
     return plan, gaussians
 

@@ -17,7 +17,7 @@ import torch
 
 from splatmill_worker.images.load import Photo
 from splatmill_worker.kernels import ops
-from splatmill_worker.scene import Camera
+from splatmill_worker.scene import Camera, Projection
 
 Float = npt.NDArray[np.float64]
 
@@ -58,14 +58,14 @@ class SweepResult(NamedTuple):
     points: positions in the world [n,3].
     colors: RGB [n,3].
     errors: mean disagreement of the neighbours, in pixels of the compared photos [n].
-    seen: which views observe each point [n,views].
+    agreeing: which neighbours show each point too [n,neighbours].
     tried: number of patches that were compared.
     """
 
     points: Float
     colors: npt.NDArray[np.uint8]
     errors: Float
-    seen: npt.NDArray[np.bool_]
+    agreeing: npt.NDArray[np.bool_]
     tried: int
 
 
@@ -90,23 +90,15 @@ class GreyView:
 
 
 def sweep(
-    index: int,
-    view: GreyView,
-    neighbours: Sequence[tuple[int, GreyView]],
-    points: Float,
-    views: int,
-    near: float,
-    far: float,
+    view: GreyView, neighbours: Sequence[GreyView], known: Projection, near: float, far: float
 ) -> SweepResult:
     """New points of the photo `view`, between the known ones.
 
-    index: number of the photo among `views` photos.
-    neighbours: at least MIN_AGREEING other photos with their numbers.
-    points: known points in the world [n,3]; cells of the photo that show one are skipped.
+    neighbours: at least MIN_AGREEING other photos.
+    known: where known points fall on the photo; cells that show one are skipped.
     near, far: range of depths, in world units; the depths compared are evenly spaced in inverse depth.
     """
     camera = view.camera
-    known = camera.project(points)
     columns, rows = _candidates(view, known.columns[known.inside], known.rows[known.inside])
     offsets = torch.arange(-RADIUS, RADIUS + 1, dtype=torch.float32)
     dy, dx = (grid.flatten() for grid in torch.meshgrid(offsets, offsets, indexing="ij"))
@@ -118,17 +110,13 @@ def sweep(
     rays, patch = rays[textured], patch[textured]
     tried = len(patch)
     if not tried:
-        return SweepResult(
-            np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), np.zeros((0, views), bool), 0
-        )
+        agreeing_none = np.zeros((0, len(neighbours)), bool)
+        return SweepResult(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), agreeing_none, 0)
     patch = patch / patch.norm(dim=1, keepdim=True)
-    poses = [other.camera.viewmat @ np.linalg.inv(camera.viewmat) for _, other in neighbours]
-    inverse, pixels = _inverse_depths([other.camera for _, other in neighbours], poses, near, far)
+    poses = [other.camera.viewmat @ np.linalg.inv(camera.viewmat) for other in neighbours]
+    inverse, pixels = _inverse_depths([other.camera for other in neighbours], poses, near, far)
     scores = torch.stack(
-        [
-            _scores(rays, patch, inverse, pose, other)
-            for (_, other), pose in zip(neighbours, poses, strict=True)
-        ]
+        [_scores(rays, patch, inverse, pose, other) for other, pose in zip(neighbours, poses, strict=True)]
     )
     best, position, agreeing, error = _peaks(scores, pixels)
     good = torch.isfinite(best).nonzero()[:, 0]
@@ -136,16 +124,12 @@ def sweep(
         np.interp(position[good].numpy(), np.arange(len(inverse)), inverse.numpy())
     )
     local = rays[good, (2 * RADIUS + 1) ** 2 // 2].double() * depth[:, None]
-    seen = np.zeros((len(good), views), bool)
-    seen[:, index] = True
-    for (k, _), agrees in zip(neighbours, agreeing[:, good].numpy(), strict=True):
-        seen[:, k] = agrees
     column, row = columns[textured][good].long().numpy(), rows[textured][good].long().numpy()
     return SweepResult(
         camera.to_world(local.numpy()),
         view.photo.rgb[row, column],
         error[good].double().numpy(),
-        seen,
+        agreeing[:, good].T.numpy(),
         tried,
     )
 

@@ -21,7 +21,8 @@ class StereoPoints:
     points: positions in the world [n,3].
     colors: RGB [n,3].
     errors: mean disagreement of the photos, in pixels of the full-size photos [n].
-    seen: which views observe each point [n,views].
+    views: numbers of the views that show the points, those of each point in order, as in `PointViews`.
+    offsets: where those of each point begin, and the end [n+1].
     seconds: time that the search took.
     given_up: whether the search ended without points, because hardly any patch of its first photos was found again.
     """
@@ -29,7 +30,8 @@ class StereoPoints:
     points: Float
     colors: npt.NDArray[np.uint8]
     errors: Float
-    seen: npt.NDArray[np.bool_]
+    views: npt.NDArray[np.int32]
+    offsets: npt.NDArray[np.int64]
     seconds: float
     given_up: bool
 
@@ -46,7 +48,8 @@ class StereoPoints:
                 stored["points"],
                 stored["colors"],
                 stored["errors"],
-                stored["seen"],
+                stored["views"],
+                stored["offsets"],
                 float(stored["seconds"]),
                 bool(stored["given_up"]),
             )
@@ -82,7 +85,6 @@ def add(scene: Scene, added: StereoPoints) -> Scene:
         note = f"{sparse}. Stereo added none: hardly any patch of the photos was found in their neighbours."
     else:
         note = f"{sparse}. Stereo added {count} points in {added.seconds:.1f} seconds."
-    lengths = added.seen.sum(1).astype(np.int32)
     errors = scene.point_errors if scene.point_errors is not None else np.full(known, np.nan)
     own = scene.point_views
     if own is None and known == 0:
@@ -94,12 +96,12 @@ def add(scene: Scene, added: StereoPoints) -> Scene:
         point_errors=np.concatenate([errors, added.errors]),
         track_lengths=None
         if own is None
-        else np.concatenate([np.diff(own.offsets).astype(np.int32), lengths]),
+        else np.concatenate([np.diff(own.offsets), np.diff(added.offsets)]).astype(np.int32),
         point_views=None
         if own is None
         else PointViews(
-            np.concatenate([own.offsets, own.offsets[-1] + np.cumsum(lengths, dtype=np.int64)]),
-            np.concatenate([own.views, np.nonzero(added.seen)[1].astype(np.int32)]),
+            np.concatenate([own.offsets, own.offsets[-1] + added.offsets[1:]]),
+            np.concatenate([own.views, added.views]),
         ),
         facts=facts,
         notes=(*scene.notes, note),

@@ -11,11 +11,13 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from splatmill_worker.images.load import load_view
+from splatmill_worker.point_batches import PointBatches
 from splatmill_worker.scene import WRONG_OUTLINES, Scene, View, looked_at
 from splatmill_worker.sfm.callbacks import OnProgress, stop_if
 from splatmill_worker.sfm.stereo.plane_sweep import MIN_AGREEING, GreyView, SweepResult, sweep
@@ -23,7 +25,7 @@ from splatmill_worker.sfm.stereo.points import StereoPoints, add, observations_p
 
 Float = npt.NDArray[np.float64]
 
-VERSION = 4
+VERSION = 5
 """Version of the method; points stored under another version are searched for anew."""
 
 ENOUGH_OBSERVATIONS = 1000
@@ -113,47 +115,64 @@ def find_points(
     grey = _grey_views(views, cancelled)
     centers, axes = scene.centers[used], np.array([view.camera.axis for view in views])
     target = looked_at(centers, axes)
-    points, batches = scene.points, list[SweepResult]()
+    known, batches, shown = PointBatches(), list[SweepResult](), list[_Shown]()
+    known.add(scene.points)
     trial = np.unique(np.linspace(0, count - 1, min(TRIAL_PHOTOS, count)).round().astype(int))
     others = np.setdiff1d(np.arange(count), trial)
     given_up = False
     for done, index in enumerate([*trial, *others], 1):
         stop_if(cancelled)
         on_progress("stereo", done - 1, count, "photos searched for more points")
-        known = grey[index].camera.project(points)
-        if known.inside.sum() >= MIN_KNOWN:
-            depths = known.depths[known.inside]
+        camera = grey[index].camera
+        place = camera.project(known.near(camera))
+        if place.inside.sum() >= MIN_KNOWN:
+            depths = place.depths[place.inside]
             near, middle, far = np.percentile(depths, [1, 50, 99]) * (1.0 / DEPTH_MARGIN, 1.0, DEPTH_MARGIN)
         else:
             middle = float(np.linalg.norm(target - centers[index]))
             near, far = DEFAULT_DEPTHS[0] * middle, DEFAULT_DEPTHS[1] * middle
         neighbours = _neighbours(index, float(middle), centers, axes)
         if len(neighbours) >= MIN_AGREEING and 0.0 < near < far:
-            found = sweep(index, grey[index], [(k, grey[k]) for k in neighbours], points, count, near, far)
+            found = sweep(grey[index], [grey[k] for k in neighbours], place, near, far)
             batches.append(found)
-            points = np.concatenate([points, found.points])
+            shown.append(_Shown.of(found, used[[index, *neighbours]]))
+            known.add(found.points)
         if done == len(trial) and _yield(batches) < MIN_YIELD:
-            given_up, points, batches = True, scene.points, []
+            given_up, batches, shown = True, [], []
             break
-    longest = max((max(view.camera.width, view.camera.height) for view in views), default=SIDE)
-    seen = np.zeros((len(points) - len(scene.points), len(scene.views)), bool)
-    seen[:, used] = np.concatenate([np.zeros((0, count), bool), *(batch.seen for batch in batches)])
-    points = points[len(scene.points) :]
+    points = np.concatenate([np.zeros((0, 3)), *(batch.points for batch in batches)])
+    lengths = np.concatenate([np.zeros(0, np.int64), *(each.lengths for each in shown)])
     kept = _inside_outlines(points, grey)
+    longest = max((max(view.camera.width, view.camera.height) for view in views), default=SIDE)
     return StereoPoints(
         points[kept],
         np.concatenate([np.zeros((0, 3), np.uint8), *(batch.colors for batch in batches)])[kept],
         np.concatenate([np.zeros(0), *(batch.errors for batch in batches)])[kept] * max(1.0, longest / SIDE),
-        seen[kept],
+        np.concatenate([np.zeros(0, np.int32), *(each.views for each in shown)])[np.repeat(kept, lengths)],
+        np.concatenate([[0], np.cumsum(lengths[kept])]),
         time.perf_counter() - started,
         given_up,
     )
 
 
+class _Shown(NamedTuple):
+    """The views that show the points found in one photo: their numbers, in order for each point, and how many."""
+
+    views: npt.NDArray[np.int32]
+    lengths: npt.NDArray[np.int64]
+
+    @staticmethod
+    def of(found: SweepResult, numbers: npt.NDArray[np.int64]) -> _Shown:
+        """numbers: of the photo and of its neighbours."""
+        order = np.argsort(numbers)
+        shows = np.column_stack([np.ones(len(found.points), bool), found.agreeing])[:, order]
+        return _Shown(numbers[order][np.nonzero(shows)[1]].astype(np.int32), shows.sum(axis=1))
+
+
 def _inside_outlines(points: Float, views: Sequence[GreyView]) -> npt.NDArray[np.bool_]:
     """Points [n,3] that lie where no photo that shows them is transparent, bool [n]; a few photos may be wrong."""
     shown, outside = np.zeros(len(points)), np.zeros(len(points))
-    for view in views:
+    for view in views if any(view.photo.alpha is not None for view in views) else ():
         place = view.camera.project(points)
         shown += place.inside
         if view.photo.alpha is not None:

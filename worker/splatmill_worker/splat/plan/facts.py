@@ -21,6 +21,7 @@ from splatmill_worker.splat.start.far_shell import shell_points
 from splatmill_worker.splat.start.gaps import gap_points, gap_share
 from splatmill_worker.splat.start.given_model import GivenModel
 from splatmill_worker.splat.start.points import ENOUGH_POINTS
+from splatmill_worker.splat.start.seeding import Seeds
 from splatmill_worker.splat.start.sky import sky_share
 from splatmill_worker.splat.views import TrainingView
 
@@ -184,8 +185,9 @@ def measure(
     held_out: int,
     speed: Speed | None,
     tell: Callable[[str], None] = lambda part: None,
-) -> Facts:
-    """Facts of `scene`, whose training photos are `views` in the same world, of any origin and unit.
+) -> tuple[Facts, Seeds | None]:
+    """Facts of `scene`, whose training photos are `views` in the same world, of any origin and unit, and the seeds that
+    were found for them; None where points are too few, or photos transparent.
 
     held_out: number of held-out photos. speed: of this machine; None where it was not probed.
     tell: called with what is measured of the photos, before each part that takes seconds where there are many.
@@ -194,6 +196,7 @@ def measure(
     sizes = np.array([[view.full.camera.width, view.full.camera.height] for view in views])
     width, height = (int(value) for value in np.median(sizes, axis=0))
     seen = Observations.of(scene, views)
+    found = _coverage(scene, views, tell)
     facts = Facts(
         views=len(views),
         held_out=held_out,
@@ -211,7 +214,7 @@ def measure(
         geometry=None
         if seen is None
         else Geometry(seen.view_angle(_own_points(scene)), seen.distance_ratio()),
-        coverage=_coverage(scene, views, tell),
+        coverage=None if found is None else found[0],
         alignment=_alignment(views),
         reprojection=_reprojection(scene, max(width, height)),
         lens_residual=_lens_residual(scene, max(width, height)),
@@ -221,7 +224,8 @@ def measure(
     )
     del seen
     memory.return_freed()  # what was compared of many photos has left hundreds of megabytes of free pieces
-    return replace(facts, memory_available=memory.available(), memory_used=memory.used() + LIBRARIES)
+    facts = replace(facts, memory_available=memory.available(), memory_used=memory.used() + LIBRARIES)
+    return facts, None if found is None else found[1]
 
 
 def halving_loss(rgb: torch.Tensor) -> float:
@@ -242,23 +246,27 @@ def _alignment(views: Sequence[TrainingView]) -> float | None:
     return float(np.linalg.norm(np.mean([view.full.camera.viewmat[2, :3] for view in views], axis=0)))
 
 
-def _coverage(scene: Scene, views: Sequence[TrainingView], tell: Callable[[str], None]) -> Coverage | None:
+def _coverage(
+    scene: Scene, views: Sequence[TrainingView], tell: Callable[[str], None]
+) -> tuple[Coverage, Seeds] | None:
     if len(scene.points) < ENOUGH_POINTS or any(view.full.alpha is not None for view in views):
         return None
     tell("comparing the photos with the points")
     cells = cells_of(scene, views)
-    shell, _ = shell_points(cells, scene.points)
+    shell, shell_colors = shell_points(cells, scene.points)
     tell("looking for gaps between the points")
-    return Coverage(
+    gaps = gap_points(cells)
+    coverage = Coverage(
         sightings=float(np.median([len(grid.points) for grid in cells])),
         in_view=_in_view(scene, views),
         sky_share=sky_share(cells),
         gap_share=gap_share(cells),
-        gap_points=len(gap_points(cells)[0]),
+        gap_points=len(gaps[0]),
         shell_points=len(shell),
         shell_distance=float(np.linalg.norm(shell, axis=1).min()) if len(shell) else None,
         extent=_extent(scene, views),
     )
+    return coverage, Seeds((shell, shell_colors), gaps)
 
 
 def _in_view(scene: Scene, views: Sequence[TrainingView]) -> float:

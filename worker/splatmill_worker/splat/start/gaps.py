@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from splatmill_worker.point_batches import PointBatches
 from splatmill_worker.splat.start.cells import Cells, Flags, Float, Index, Pixels, cells_near, projected
 from splatmill_worker.splat.start.sky import sky_of
 
@@ -28,7 +29,7 @@ def gap_points(cells: Sequence[Cells]) -> tuple[Float, Pixels]:
     A point is placed at the mean inverse depth of the nearest points in its photo. The photos are processed in order:
     a cell gets no point where a gap point of an earlier photo lies in it at about the same depth.
     """
-    points: list[Float] = [np.empty((0, 3))]
+    earlier, points = PointBatches(), [np.empty((0, 3))]
     colors: list[Pixels] = [np.empty((0, 3), np.uint8)]
     for grid in cells:
         rows = np.argwhere(_gaps(grid))
@@ -37,13 +38,14 @@ def gap_points(cells: Sequence[Cells]) -> tuple[Float, Pixels]:
         depth = _depths(_one_per_cell(grid.points), rows)
         wanted = np.full(grid.covered.shape, np.inf)
         wanted[rows[:, 0], rows[:, 1]] = depth
-        earlier = projected(grid.camera, np.concatenate(points))
+        seen = projected(grid.camera, earlier.near(grid.camera))
         # Infinite where no depth is wanted, so that no earlier point agrees there.
-        expected = wanted[earlier[:, 1].astype(np.int64), earlier[:, 0].astype(np.int64)]
-        agree = (earlier[:, 2] < MAX_DEPTH_RATIO * expected) & (earlier[:, 2] > expected / MAX_DEPTH_RATIO)
-        taken = cells_near(earlier[agree], grid.color.shape[:2], spread=0)
+        expected = wanted[seen[:, 1].astype(np.int64), seen[:, 0].astype(np.int64)]
+        agree = (seen[:, 2] < MAX_DEPTH_RATIO * expected) & (seen[:, 2] > expected / MAX_DEPTH_RATIO)
+        taken = cells_near(seen[agree], grid.color.shape[:2], spread=0)
         free = ~taken[rows[:, 0], rows[:, 1]]
         points.append(grid.unproject(rows[free], depth[free]))
+        earlier.add(points[-1])
         colors.append(grid.color[rows[free, 0], rows[free, 1]])
     return np.concatenate(points), np.concatenate(colors)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -21,11 +22,23 @@ Float = npt.NDArray[np.float64]
 Pixels = npt.NDArray[np.uint8]
 
 
+class Seeds(NamedTuple):
+    """Points [k, 3] and colours [k, 3] of what may be added, found in the photos as they are.
+
+    shell: on the far shell.
+    gaps: in the gaps between the points.
+    """
+
+    shell: tuple[Float, Pixels]
+    gaps: tuple[Float, Pixels]
+
+
 def add_seeds(
     gaussians: Gaussians,
     scene: Scene,
     views: Sequence[TrainingView],
     *,
+    seeds: Seeds | None = None,
     fill_gaps: bool,
     add_far_shell: bool,
     max_gaussians: int,
@@ -37,17 +50,19 @@ def add_seeds(
     At most `max_gaussians` result. Where there would be more, those added are thinned evenly: those in the gaps first,
     then those on the shell.
 
+    seeds: those of these photos; None: they are found.
     tell: called with what is done, before the part that takes seconds where there are many photos.
     """
     if not (fill_gaps or add_far_shell):
         return gaussians
-    cells = cells_of(scene, views)
+    cells = cells_of(scene, views) if seeds is None else []
     found: list[tuple[Float, Pixels, float]] = []
     if add_far_shell:
-        found.append((*far_shell.shell_points(cells, scene.points), far_shell.OPACITY))
+        shell = far_shell.shell_points(cells, scene.points) if seeds is None else seeds.shell
+        found.append((*shell, far_shell.OPACITY))
     if fill_gaps:
         tell("filling gaps between the points")
-        found.append((*gaps.gap_points(cells), INITIAL_OPACITY))
+        found.append((*(gaps.gap_points(cells) if seeds is None else seeds.gaps), INITIAL_OPACITY))
     parts = [gaussians]
     room = max(0, max_gaussians - gaussians.count)
     for points, colors, opacity in found:

@@ -18,7 +18,7 @@ from splatmill_worker.splat.plan.rates import RateSchedule, boost_of
 from splatmill_worker.splat.train.curve import validated
 from splatmill_worker.splat.train.density.densify import densify
 from splatmill_worker.splat.train.dropout import dropout
-from splatmill_worker.splat.train.health import LossHealth
+from splatmill_worker.splat.train.health import LossHealth, not_finite
 from splatmill_worker.splat.train.pace import Pace
 from splatmill_worker.splat.train.poses import Poses
 from splatmill_worker.splat.train.renderer import fixed_background
@@ -247,7 +247,7 @@ class TrainingRun:
     def _checked_snapshot(self) -> Snapshot:
         """A snapshot to roll back to. Raises TrainingFailed where parameters are not finite."""
         snapshot = self.snapshot()
-        bad = sum(int((~torch.isfinite(value)).sum()) for value in snapshot.parameters.values())
+        bad = sum(not_finite(value) for value in snapshot.parameters.values())
         if bad:
             raise TrainingFailed(
                 FailureName.non_finite, f"{bad} parameters are not finite.", step=self.state.step
