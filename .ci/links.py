@@ -51,19 +51,19 @@ def main(folder: Path) -> None:
     """Fill the folder."""
     programs = list(declared())
     allowed = files(with_what_they_need({"apt", *base(), *(package for _, package in programs)}))
-    found = {"python3": sys.executable}
+    paths = {"python3": sys.executable}
     for place in filter(os.path.isdir, FOLDERS):
         for entry in os.scandir(place):
             # Names of Debian's alternatives, such as c++ and awk, belong to no package; what they lead to does.
             if os.path.realpath(entry.path) in allowed:
-                found.setdefault(entry.name, entry.path)
+                paths.setdefault(entry.name, entry.path)
     for names, package in programs:
-        present = {name: path for name in names if (path := found.get(name) or shutil.which(name))}
+        present = {name: path for name in names if (path := paths.get(name) or shutil.which(name))}
         if not present:
             sys.exit(f"{names[0]} is not on PATH, and no package has installed it (Debian: {package}).")
-        found |= present
+        paths |= present
     folder.mkdir(parents=True, exist_ok=True)
-    for name, path in found.items():
+    for name, path in paths.items():
         (folder / name).symlink_to(path)
 
 

@@ -18,10 +18,10 @@ SOURCES = {
 def version() -> str:
     for path, pattern in SOURCES.items():
         if path.is_file():
-            found = re.search(pattern, path.read_text(encoding="utf-8"), re.MULTILINE)
-            if found is None:
+            match = re.search(pattern, path.read_text(encoding="utf-8"), re.MULTILINE)
+            if match is None:
                 raise SystemExit(f"{path} names no version.")
-            return found[1]
+            return match[1]
     raise SystemExit(f"Found no version: none of {', '.join(map(str, SOURCES))} is there.")
 
 

@@ -118,8 +118,8 @@ def test_a_name_of_the_schema_is_one_thing_in_all_its_modules():
     exported = re.findall(r"\b(\w+) as \1\b", Path(schema.__file__).read_text())
     assert len(exported) > 200
     for name in exported:
-        found = {id(vars(module)[name]) for module in modules if name in vars(module)}
-        assert found == {id(getattr(schema, name))}, name
+        ids = {id(vars(module)[name]) for module in modules if name in vars(module)}
+        assert ids == {id(getattr(schema, name))}, name
     with pytest.raises(AttributeError, match="no_such_name"):
         _ = schema.no_such_name
 
@@ -132,7 +132,7 @@ def test_untrusted_files_are_opened_in_one_place():
     guarded = PARTS["splatmill_worker"] / "images" / "guarded.py"
     opencv = PARTS["splatmill_worker"] / "opencv.py"
     decoders = {"cv2", "imageio", "skimage", "tifffile", "rawpy", "torchvision", "decord", "moviepy", "wand"}
-    found = []
+    places = []
     for path in [
         *(p for part in PARTS.values() for p in part.rglob("*.py")),
         *(ROOT / "worker/bench").rglob("*.py"),
@@ -140,17 +140,17 @@ def test_untrusted_files_are_opened_in_one_place():
         for node in ast.walk(ast.parse(path.read_text())):
             match node:
                 case ast.Call(func=ast.Attribute(attr="open", value=ast.Name(id="Image"))) if path != guarded:
-                    found.append(f"{path}:{node.lineno}")
+                    places.append(f"{path}:{node.lineno}")
                 case ast.Call(func=ast.Attribute(attr="open", value=ast.Name(id="av"))) if path != guarded:
                     if [arg.value for arg in node.args[1:2] if isinstance(arg, ast.Constant)] != ["w"]:
-                        found.append(f"{path}:{node.lineno}")
+                        places.append(f"{path}:{node.lineno}")
                 case ast.ImportFrom(module="PIL.Image" | "av" | "av.container"):
-                    found.append(f"{path}:{node.lineno}")
+                    places.append(f"{path}:{node.lineno}")
                 case ast.Import() | ast.ImportFrom():
                     names = [getattr(node, "module", None) or "", *(alias.name for alias in node.names)]
                     if decoders & {name.partition(".")[0] for name in names} and path != opencv:
-                        found.append(f"{path}:{node.lineno}")
-    assert not found
+                        places.append(f"{path}:{node.lineno}")
+    assert not places
     assert set(re.findall(r"cv2\.(\w+)", opencv.read_text())) == {"setNumThreads", "SIFT", "__version__"}
 
 
@@ -178,13 +178,13 @@ def test_header_fields_and_addresses_of_others_are_parsed_in_one_place_each():
         r"headers\b[^\n]*\.isdigit\(": set(),
     }
     for pattern, allowed in parsers.items():
-        found = {
+        files = {
             path.relative_to(ROOT).as_posix()
             for part in ("splatmill", "splatmill_server")
             for path in PARTS[part].rglob("*.py")
             if re.search(pattern, path.read_text())
         }
-        assert found == allowed, pattern
+        assert files == allowed, pattern
 
 
 def test_keys_of_rq_are_named_in_one_place():

@@ -31,12 +31,12 @@ def pages() -> Iterator[Path]:
 
 def links() -> dict[str, list[str]]:
     """Names linked to, each with the files that link to it. The name may stand on the line after "(decisions:"."""
-    found: dict[str, list[str]] = {}
+    sources: dict[str, list[str]] = {}
     for path in pages():
         for name in re.findall(r"\(decisions:[\s#/*]*([^)]*)\)?", path.read_text()):
             if name != PLACEHOLDER:
-                found.setdefault(name, []).append(str(path.relative_to(ROOT)))
-    return found
+                sources.setdefault(name, []).append(str(path.relative_to(ROOT)))
+    return sources
 
 
 def entries() -> dict[str, str]:

@@ -396,6 +396,6 @@ def _answers() -> list[str]:
     parts = ["## What is answered\n"]
     for area in dict.fromkeys(example.area for example in EXAMPLES):
         answers = [(example.what, answer(example.make)) for example in EXAMPLES if example.area == area]
-        rows = [[what, given.kind, " ".join(given.said)] for what, given in answers]
+        rows = [[what, reply.kind, " ".join(reply.said)] for what, reply in answers]
         parts += [f"### {area}\n", table(["input", "answer", "message"], rows)]
     return parts

@@ -20,7 +20,7 @@ processes share are in Redis. One that comes back empty begins at zero, as a cou
 _TOGETHER = {OF_PROCESS: "sum", SAME: "max", SMALLEST: "min"}
 
 
-def found() -> list[Metric]:
+def metrics() -> list[Metric]:
     """Every family of metrics that an API process has, by name."""
     all_of_them = [*Metrics().registry.collect(), *families(None), *of_disk(None), *of_renderer(None)]
     return sorted(all_of_them, key=lambda family: family.name)
@@ -28,13 +28,14 @@ def found() -> list[Metric]:
 
 def names() -> dict[str, str]:
     """The name of each metric as it is asked for, and how the values of several processes are put together."""
-    return {_name(family): _together(family)[1] for family in found()}
+    return {_name(family): _together(family)[1] for family in metrics()}
 
 
 def page() -> str:
     """The page of metrics."""
     rows = [
-        [code(_name(family)), family.type, choices(_labels(family)), *_together(family)] for family in found()
+        [code(_name(family)), family.type, choices(_labels(family)), *_together(family)]
+        for family in metrics()
     ]
     return f"{INTRODUCTION}\n{table(['metric', 'type', 'labels', 'meaning', 'processes'], rows)}"
 
@@ -50,13 +51,13 @@ def _labels(family: Metric) -> tuple[str, ...]:
         for metric in vars(Metrics()).values()
         if hasattr(metric, "_labelnames")
     }
-    found: Any = shared.get(family.name) or own.get(family.name) or getattr(family, "_labelnames", ())
-    return tuple(found)
+    labels: Any = shared.get(family.name) or own.get(family.name) or getattr(family, "_labelnames", ())
+    return tuple(labels)
 
 
 def _together(family: Metric) -> tuple[str, str]:
-    text, found = family.documentation, ""
+    text, way = family.documentation, ""
     for sentence, word in _TOGETHER.items():
         if text.endswith(sentence):
-            text, found = text.removesuffix(sentence).strip(), word
-    return text, found
+            text, way = text.removesuffix(sentence).strip(), word
+    return text, way

@@ -106,10 +106,10 @@ def _shown(path: Path) -> str:
 def _sentence(path: Path) -> str:
     """The first sentence of a module, or of a package."""
     source = path / "__init__.py" if path.is_dir() else path
-    found = re.match(r'"""(.+?)(?:\n\n|""")', source.read_text(), re.S)
-    if found is None:
+    match = re.match(r'"""(.+?)(?:\n\n|""")', source.read_text(), re.S)
+    if match is None:
         raise ValueError(f"{source} does not begin with a sentence that says what it is for.")
-    return re.split(r"(?<=\.) (?=[A-Z`])", " ".join(found[1].split()), maxsplit=1)[0]
+    return re.split(r"(?<=\.) (?=[A-Z`])", " ".join(match[1].split()), maxsplit=1)[0]
 
 
 def _names(path: Path) -> list[str]:

@@ -90,10 +90,10 @@ def measure(options: argparse.Namespace) -> Iterator[Row]:
         for number in range(options.repetitions):
             yield {"bench": "abuse", "run": run, "abused": False, "repetition": number, **trainer.run()}
         storage = Path(name) / "data" / "storage"
-        with _watched(storage, trainer.records) as seen, _abusing(abuses) as answers:
+        with _watched(storage, trainer.records) as peak, _abusing(abuses) as answers:
             rows = [trainer.run() for _ in range(options.repetitions)]
         for number, row in enumerate(rows):
-            also = {"limit": LIMIT, "most_bytes": seen[0], "answers": answers}
+            also = {"limit": LIMIT, "most_bytes": peak[0], "answers": answers}
             yield {"bench": "abuse", "run": run, "abused": True, "repetition": number, **row, **also}
 
 
@@ -168,8 +168,8 @@ def _watched(storage: Path, others: set[str]) -> Iterator[list[int]]:
 
 def _entries(folder: Path) -> list[os.DirEntry[str]]:
     try:
-        with os.scandir(folder) as found:
-            return list(found)
+        with os.scandir(folder) as entries:
+            return list(entries)
     except (FileNotFoundError, NotADirectoryError):
         return []  # not made yet, or deleted meanwhile
 
@@ -215,7 +215,7 @@ def seconds(rows: list[Row]) -> str:
     """What the owner who trains waits for, and what came of its jobs."""
     ways = newest(rows)
     lines = [
-        [what, *(f"{shown(median(found, name))} ({shown(worst(found, name))})" for found in ways)]
+        [what, *(f"{shown(median(way, name))} ({shown(worst(way, name))})" for way in ways)]
         for name, what in MEASURED.items()
     ]
     held: dict[str, Callable[[Row], bool]] = {
@@ -224,7 +224,7 @@ def seconds(rows: list[Row]) -> str:
         "uploads without a conflict": lambda row: not row["upload_conflicts"],
     }
     for what, count in held.items():
-        lines.append([what, *(f"{sum(map(count, found))} of {len(found)}" for found in ways)])
+        lines.append([what, *(f"{sum(map(count, way))} of {len(way)}" for way in ways)])
     return table("of the owner who trains|alone|under abuse", lines)
 
 
@@ -242,7 +242,7 @@ def responses(rows: list[Row]) -> str:
         kind, _, status = name.partition(" ")
         kinds.setdefault(kind, []).append(f"{status}: {count}")
     return table(
-        "request|answers, by status or error", ([kind, ", ".join(found)] for kind, found in kinds.items())
+        "request|answers, by status or error", ([kind, ", ".join(counts)] for kind, counts in kinds.items())
     )
 
 
@@ -258,7 +258,7 @@ STUDY = Study(
         "seconds": seconds,
         "stored": stored,
         "responses": responses,
-        "footer": lambda rows: footer([row for found in newest(rows) for row in found]),
+        "footer": lambda rows: footer([row for way in newest(rows) for row in way]),
     },
     figures={},
     options={

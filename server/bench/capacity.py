@@ -169,8 +169,8 @@ def _timed(what: str, service: Service, act: Any) -> Row:
         began = time.perf_counter()
         act()
         seconds = time.perf_counter() - began
-    found = {"round_trips": operations.round_trips, "storage": sum(operations.storage.values())}
-    return {"what": what, "seconds": seconds, **found}
+    counts = {"round_trips": operations.round_trips, "storage": sum(operations.storage.values())}
+    return {"what": what, "seconds": seconds, **counts}
 
 
 def _memory(when: str, service: Service) -> Row:

@@ -137,8 +137,8 @@ class Fleet:
         return self._read()
 
     def _read(self) -> Row:
-        found = [json.loads(cast(Any, process.stdout).readline()) for process in self._processes]
-        return {name: sum(counts[name] for counts in found) for name in found[0]}
+        readings = [json.loads(cast(Any, process.stdout).readline()) for process in self._processes]
+        return {name: sum(counts[name] for counts in readings) for name in readings[0]}
 
 
 def _started(fleet: Fleet, before: meter.Look, after: meter.Look) -> Row:
@@ -232,7 +232,7 @@ def _training(fleet: Fleet, api: Api, connection: redis.Redis, folder: Path, sec
 
     _until(begun)
     time.sleep(1.0)  # for streams of more than one entry
-    found = _window(fleet, connection, seconds)
+    window = _window(fleet, connection, seconds)
     entry = _entry_bytes(connection)
     looked, page = (
         min((api.look() for _ in range(3)), key=lambda row: (row["round_trips"], row["cpu_seconds"])),
@@ -241,8 +241,8 @@ def _training(fleet: Fleet, api: Api, connection: redis.Redis, folder: Path, sec
     over.touch()
     with api.looking():
         _until(lambda: connection.scard(keys.ACTIVE) == 0)
-    more = {"jobs": jobs, "bytes_each": (found["bytes"] - idle.memory) / jobs, "entry_bytes": entry}
-    return {**found, **more, "look": looked, "page": page}
+    more = {"jobs": jobs, "bytes_each": (window["bytes"] - idle.memory) / jobs, "entry_bytes": entry}
+    return {**window, **more, "look": looked, "page": page}
 
 
 def _under_way(connection: redis.Redis) -> bool:

@@ -64,9 +64,9 @@ def fuzzed(name: str, seconds: float, seed: int) -> Row:
         return {**about, **nothing, "fault": "it did not end"}
     if ran.returncode:
         return {**about, **nothing, "fault": f"it ended with status {ran.returncode}: {ran.stderr[-3000:]}"}
-    found: Row = json.loads(ran.stdout.splitlines()[-1])
-    grown = found["grown_bytes"] > MEMORY
-    return {**about, **found, "fault": f"it grew by {found['grown_bytes']} bytes" if grown else ""}
+    outcome: Row = json.loads(ran.stdout.splitlines()[-1])
+    grown = outcome["grown_bytes"] > MEMORY
+    return {**about, **outcome, "fault": f"it grew by {outcome['grown_bytes']} bytes" if grown else ""}
 
 
 COLUMNS: list[Column] = [

@@ -84,13 +84,13 @@ def _measure(asked: argparse.Namespace) -> Iterator[Row]:
         if asked.idle:
             http.post(f"/v1/jobs/{job}/cancel")
         for count in asked.clients:
-            found = _with_clients(url, up, count, asked, job, model, camera)
-            for row in found["requests"]:
+            outcome = _with_clients(url, up, count, asked, job, model, camera)
+            for row in outcome["requests"]:
                 yield {
                     "bench": "load", "label": asked.label, "clients": count, "seconds": asked.seconds,
-                    "training": not asked.idle, **row, "processes": found["processes"],
+                    "training": not asked.idle, **row, "processes": outcome["processes"],
                 }  # fmt: skip
-            print(found["processes"], found["errors"][:5], flush=True)
+            print(outcome["processes"], outcome["errors"][:5], flush=True)
         http.post(f"/v1/jobs/{job}/cancel")
         http.close()
 
@@ -99,7 +99,7 @@ def _with_clients(
     url: str, up: psutil.Process, count: int, asked: argparse.Namespace, job: str, model: str, camera: Row
 ) -> Row:
     """Return what the clients met, and what the processes took meanwhile."""
-    given = {
+    arguments = {
         "url": url,
         "clients": count,
         "seconds": asked.seconds,
@@ -109,7 +109,7 @@ def _with_clients(
     }
     environment = os.environ | {"PYTHONPATH": str(HERE)}
     clients = subprocess.Popen(
-        [sys.executable, "-m", "_load.clients", json.dumps(given)],
+        [sys.executable, "-m", "_load.clients", json.dumps(arguments)],
         env=environment,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -125,8 +125,8 @@ def _with_clients(
         raise SystemExit(f"The {count} clients ended with status {clients.returncode}:\n{complaints[-2000:]}")
     taken["machine"] = {"cores": round((worked() - all_before) / (time.monotonic() - begun), 2)}
     taken["api"]["ms_per_answer"] = round(1000 * (_cpu(api) - cpu) / max(1, _answered(url) - before), 2)
-    found: Row = json.loads(said.splitlines()[-1])
-    return found | {"processes": taken}
+    outcome: Row = json.loads(said.splitlines()[-1])
+    return outcome | {"processes": taken}
 
 
 def _answered(url: str) -> float:
@@ -264,11 +264,11 @@ def _draw(rows: list[Row]) -> Figure:
     figure, panels = _plot.axes(2)
     for panel, what in zip(panels, ("job", "view"), strict=True):
         for label in distinct(rows, "label"):
-            found = {row["clients"]: row for row in of(rows, what=what, label=label)}
-            counts = sorted(found)
+            by_count = {row["clients"]: row for row in of(rows, what=what, label=label)}
+            counts = sorted(by_count)
             for key, style in (("p50_ms", "--"), ("p99_ms", "-")):
                 name = f"{key[:3]} {label}".strip()
-                panel.plot(counts, [found[count][key] for count in counts], style, marker="o", label=name)
+                panel.plot(counts, [by_count[count][key] for count in counts], style, marker="o", label=name)
         panel.axhline(50 if what == "job" else 100, color="#999999", linewidth=0.8)
         panel.set(xlabel="clients", ylabel="milliseconds", xscale="log", yscale="log", title=what)
         panel.legend(fontsize=8)

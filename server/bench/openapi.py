@@ -122,10 +122,10 @@ def _round(url: str, kept: Row, folder: Path, seed: int, examples: int, phases: 
         raise SystemExit(
             f"schemathesis ended with status {ran.returncode}:\n{ran.stdout[-2000:]}{ran.stderr[-2000:]}"
         )
-    found: Row = json.loads(report.read_text())
-    if found["exit_code"]:
+    content: Row = json.loads(report.read_text())
+    if content["exit_code"]:
         print(ran.stdout[-60_000:], flush=True)
-    return found
+    return content
 
 
 def _records(http: httpx.Client) -> dict[str, list[str]]:

@@ -83,7 +83,7 @@ def main(argv: list[str]) -> int:
     table = HERE / "soak.md" if asked.results.parent == HERE / "results" else asked.results.with_suffix(".md")
     complaints: list[str] = []
     if not asked.plot_only:
-        found = soak(
+        new_rows = soak(
             s3=asked.storage == "s3",
             count=asked.faults,
             seed=asked.seed,
@@ -92,10 +92,10 @@ def main(argv: list[str]) -> int:
             patience=asked.patience,
             keep=asked.keep,
         )
-        complaints = found[-1]["complaints"]
+        complaints = new_rows[-1]["complaints"]
         kept = [row for row in lines(asked.results) if row["storage"] != asked.storage]
         asked.results.unlink(missing_ok=True)
-        for row in kept + [row | origin("server", "client") for row in found]:
+        for row in kept + [row | origin("server", "client") for row in new_rows]:
             append(asked.results, row)
     rows = lines(asked.results)
     if not rows:
@@ -285,12 +285,12 @@ def _storage_part(storage: str, rows: list[Row], names: list[str]) -> list[str]:
         "|---|---:|---:|---:|---:|---:|---:|---:|",
     ]
     for name in names:
-        found = [row for row in rows if row["fault"] == name]
-        if found:
-            waited = [row for row in found if any(row[what] is not None for what in MEASURED)]
+        strikes = [row for row in rows if row["fault"] == name]
+        if strikes:
+            waited = [row for row in strikes if any(row[what] is not None for what in MEASURED)]
             cells = [_seconds([row[what] for row in waited if row[what] is not None]) for what in MEASURED]
-            failed = sum(row["complaint"] is not None for row in found)
-            text.append(f"| {name} | {len(found)} | {len(waited)} | {' | '.join(cells)} | {failed} |")
+            failed = sum(row["complaint"] is not None for row in strikes)
+            text.append(f"| {name} | {len(strikes)} | {len(waited)} | {' | '.join(cells)} | {failed} |")
     return [*text, ""]
 
 

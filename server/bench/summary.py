@@ -50,18 +50,18 @@ Told = Iterable[tuple[str, str, list[Row]]]
 
 def _soak(rows: list[Row]) -> Told:
     for storage, words in (("folder", "a folder"), ("s3", "S3")):
-        found = [row for row in rows if row["storage"] == storage]
-        ends = [row for row in found if row["fault"] is None]
+        group = [row for row in rows if row["storage"] == storage]
+        ends = [row for row in group if row["fault"] is None]
         if not ends:
             continue
         end = ends[-1]
         held = "nothing lost, run twice or left over, and no job failed of a fault"
         if end["complaints"]:
             held = f"**{len(end['complaints'])} things did not hold**"
-        waits = [row["resumes"] for row in found if row.get("resumes") is not None]
+        waits = [row["resumes"] for row in group if row.get("resumes") is not None]
         back = f"; jobs went on within {max(waits):.0f} s" if waits else ""
         yield (
-            f"{end['faults']} faults, {end['killed']} of them kills ({kills(found)}), while {end['jobs']} jobs of the "
+            f"{end['faults']} faults, {end['killed']} of them kills ({kills(group)}), while {end['jobs']} jobs of the "
             f"engine ran: {jobs(end)}; storage in {words}",
             held + back,
             [end],

@@ -45,15 +45,15 @@ IMPORTS = {
 
 def node() -> list[str]:
     """Return the command that runs Node."""
-    if (found := shutil.which("node")) is not None:
-        return [found]
+    if (path := shutil.which("node")) is not None:
+        return [path]
     return [str(_wheel() / "bin" / ("node.exe" if sys.platform == "win32" else "node"))]
 
 
 def npm() -> list[str]:
     """Return the command that runs npm."""
-    if (found := shutil.which("npm")) is not None and shutil.which("node") is not None:
-        return [found]
+    if (path := shutil.which("npm")) is not None and shutil.which("node") is not None:
+        return [path]
     cli = sorted(_wheel().rglob("node_modules/npm/bin/npm-cli.js"))
     return [str(_wheel() / "bin" / "node"), str(cli[0])]
 

@@ -38,14 +38,14 @@ def whole(tmp_path: Path) -> Scene:
         path.parent.mkdir(exist_ok=True)
         Image.new("RGB", (camera.width, camera.height), (at, 0, 0)).save(path)
         views.append(View(path.name, camera, path))
-    seen = [np.sort(rng.choice(TRAIN + TEST, rng.integers(2, 7), replace=False)) for _ in range(POINTS)]
+    tracks = [np.sort(rng.choice(TRAIN + TEST, rng.integers(2, 7), replace=False)) for _ in range(POINTS)]
     return Scene(
         tuple(views),
         rng.normal(0, 0.2, (POINTS, 3)),
         rng.integers(0, 256, (POINTS, 3)).astype(np.uint8),
         "colmap",
         point_views=PointViews(
-            np.cumsum([0, *map(len, seen)]).astype(np.int64), np.concatenate(seen).astype(np.int32)
+            np.cumsum([0, *map(len, tracks)]).astype(np.int64), np.concatenate(tracks).astype(np.int32)
         ),
     )
 
@@ -55,9 +55,9 @@ def test_training_photos_are_thinned_out_and_held_out_ones_stay(
 ) -> None:
     train, test = split_views(whole, TrainOptions(holdout=5))
     few.make("synthetic-9", tmp_path / "capture", whole, train, test)
-    found = posed.find(tmp_path / "capture")
-    assert found is not None
-    scene = found.load()
+    poses = posed.find(tmp_path / "capture")
+    assert poses is not None
+    scene = poses.load()
     chosen, held_out = split_views(scene, TrainOptions(test_views=tuple(few.held_out("synthetic-9"))))
     assert [view.image.resolve() for view in held_out] == [view.image for view in test]
     numbers = [

@@ -24,16 +24,16 @@ bench = importlib.import_module("functions")
 def test_what_is_counted_is_right() -> None:
     """A correctly rounded function has errors of up to half an ulp, no more, and just so; 1/sqrt x is not sqrt x."""
     (function,) = [f for f in FUNCTIONS if f.name == "sqrt"]
-    found = measure("baseline", function)
-    assert found["count"] == 2**24
-    assert found["unlike"] == 0
+    row = measure("baseline", function)
+    assert row["count"] == 2**24
+    assert row["unlike"] == 0
     # The power of 2 is looked at: by that of 1/sqrt x, only the octaves themselves agree.
     assert load("baseline").unlike_octaves(b"sqrt", 0, 2, -1) == 2 * 2**24
-    assert found["rounded"] == 1
-    assert 0.4999 < found["ulp"] <= 0.5
+    assert row["rounded"] == 1
+    assert 0.4999 < row["ulp"] <= 0.5
     # Errors of rounding are spread evenly over an ulp: 1/sqrt 12 of it in the root mean square.
-    assert found["rms_ulp"] == pytest.approx(12**-0.5, rel=1e-3)
-    assert found["absolute"] == pytest.approx(2.0**-24, rel=1e-3)
+    assert row["rms_ulp"] == pytest.approx(12**-0.5, rel=1e-3)
+    assert row["absolute"] == pytest.approx(2.0**-24, rel=1e-3)
     with pytest.raises(ValueError, match="no function 'sine'"):
         errors(load("baseline"), "sine", [(0, 1)])
 
@@ -105,6 +105,6 @@ def test_the_page_of_the_documentation_is_made_from_rows() -> None:
 def test_what_is_left_out_near_0_has_one_result(name: str, at_0: float, build: str) -> None:
     """The error is then that of the result at 0, but for the distance from 1 of the exact value."""
     ends = (place(-NEAR_0), place(NEAR_0) + 1)
-    found = errors(load(build), name, [ends], stride=100_003)
-    assert found.count > 10_000
-    assert found.absolute == pytest.approx(1 - at_0, abs=1.01 * NEAR_0)
+    totals = errors(load(build), name, [ends], stride=100_003)
+    assert totals.count > 10_000
+    assert totals.absolute == pytest.approx(1 - at_0, abs=1.01 * NEAR_0)

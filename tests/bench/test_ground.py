@@ -52,15 +52,15 @@ def test_camera_errors_are_those_after_the_best_similarity(tmp_path: Path) -> No
     (tmp_path / "truth").mkdir()
     write_truth(cameras, tmp_path / "truth")
     turn = viewmat_of(np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]), np.zeros(3))
-    found = []
+    records = []
     for name, camera in cameras.items():
         pose = turn @ np.linalg.inv(camera.viewmat)
         pose[:3, 3] = 0.2 * pose[:3, 3] + [3.0, -7.0, 11.0]
         if name == "7.jpg":  # turned by two degrees about its axis
             c, s = np.cos(np.radians(2.0)), np.sin(np.radians(2.0))
             pose[:3, :3] = pose[:3, :3] @ [[c, -s, 0], [s, c, 0], [0, 0, 1]]
-        found.append({"name": name, "camera": {"camera_to_world": pose.tolist()}})
-    (tmp_path / "cameras.json").write_text(json.dumps({"cameras": found}))
+        records.append({"name": name, "camera": {"camera_to_world": pose.tolist()}})
+    (tmp_path / "cameras.json").write_text(json.dumps({"cameras": records}))
     errors = camera_errors(tmp_path / "cameras.json", tmp_path / "truth")
     assert errors["cameras"] == 20
     assert errors["rotation_deg"] == pytest.approx(0.0, abs=1e-3)

@@ -66,11 +66,11 @@ def test_every_replaced_function_is_there_and_comes_back(instead: Any, switches:
 def test_cameras_of_a_switch_of_their_recovery_are_kept_apart(switches: dict[str, Switch]) -> None:
     scenes = importlib.import_module("_train.scenes")
     assert [name for name, switch in switches.items() if switch.recovers] == ["folds-left"]
-    given = scenes.Scene("given", BENCH, posed=True)
+    with_cameras = scenes.Scene("given", BENCH, posed=True)
     recovered = scenes.Scene("recovered", BENCH)
-    assert not switches["folds-left"].concerns(given)
+    assert not switches["folds-left"].concerns(with_cameras)
     assert switches["folds-left"].concerns(recovered)
-    assert switches["cleaned"].concerns(given)
+    assert switches["cleaned"].concerns(with_cameras)
 
 
 def _run() -> TrainingRun:
@@ -86,12 +86,12 @@ def test_masked_outliers_count_no_longer(instead: Any, monkeypatch: pytest.Monke
     outliers = torch.zeros(6, 8, dtype=torch.bool)
     outliers[:, 4:] = True
     clean = torch.zeros_like(outliers)
-    found = tuple(
+    photos = tuple(
         Disagreement(view.name, 0.0, 0.0, None, outliers if at == 0 else clean)
         for at, view in enumerate(run.views)
     )
-    monkeypatch.setattr(instead, "disagreements", lambda _run, _learnt: found)
-    assert instead.without_outliers(run, range(len(run.views))) == found
+    monkeypatch.setattr(instead, "disagreements", lambda _run, _learnt: photos)
+    assert instead.without_outliers(run, range(len(run.views))) == photos
     mask = run.views[0].full.mask
     assert mask is not None
     assert mask[:, :48].all()
@@ -109,11 +109,11 @@ def test_masked_outliers_count_no_longer(instead: Any, monkeypatch: pytest.Monke
 def test_no_step_is_taken_on_a_photo_that_is_named(instead: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     run = _run()
     named = {run.views[2].name, run.views[5].name}
-    found = tuple(
+    photos = tuple(
         Disagreement(view.name, 0.0, 0.0, "moving things" if view.name in named else None, torch.zeros(1, 1))
         for view in run.views
     )
-    monkeypatch.setattr(instead, "disagreements", lambda _run, _learnt: found)
+    monkeypatch.setattr(instead, "disagreements", lambda _run, _learnt: photos)
     instead.without_named_photos(run, range(len(run.views)))
     taken = [run.views[run._next_view()].name for _ in range(5 * len(run.views))]
     assert set(taken) == {view.name for view in run.views} - named

@@ -21,13 +21,13 @@ def test_points_on_a_solid_have_no_distance_and_others_theirs(life: StillLife) -
         on = truth.on_solid(solid, 500, random)
         assert truth.distance(on, solid).max() < 1e-9
         away = on + random.normal(size=on.shape)
-        found = truth.distance(away, solid)
+        distances = truth.distance(away, solid)
         dense = truth.on_solid(solid, 20_000, random)
         nearest = np.array([np.linalg.norm(dense - point, axis=1).min() for point in away[:40]])
         if not hasattr(solid, "half_height"):  # whose lower end has no samples
-            assert (found[:40] <= nearest + 1e-9).all()
+            assert (distances[:40] <= nearest + 1e-9).all()
         if getattr(solid, "z", 0.0) == 0.0 and not hasattr(solid, "half_height"):
-            assert (nearest - found[:40]).max() < 0.1
+            assert (nearest - distances[:40]).max() < 0.1
 
 
 def table(height: float) -> Mesh:
@@ -62,13 +62,13 @@ def test_a_plane_over_the_table_scores_by_its_height(
 def test_what_no_two_cameras_see_is_not_asked_for(life: StillLife, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(truth, "SAMPLES", 3000)
     above = [look_at(np.array([0.1 * k, 0.2, 5.0]), np.zeros(3), 400, 400, 300.0) for k in range(3)]
-    seen = truth.visible(life, above)
-    assert len(seen) > 500
-    assert truth.within(seen).all()
+    points = truth.visible(life, above)
+    assert len(points) > 500
+    assert truth.within(points).all()
     spheres = [solid for solid in life.solids if hasattr(solid, "radius") and hasattr(solid, "center")]
     for sphere in spheres:
         if not hasattr(sphere, "half_height"):
-            near = np.abs(np.linalg.norm(seen - sphere.center, axis=1) - sphere.radius) < 1e-6
+            near = np.abs(np.linalg.norm(points - sphere.center, axis=1) - sphere.radius) < 1e-6
             assert near.any()
-            assert (seen[near, 2] > sphere.center[2] - 0.05).all()  # their undersides are hidden from above
+            assert (points[near, 2] > sphere.center[2] - 0.05).all()  # their undersides are hidden from above
     assert len(truth.visible(life, above[:1])) == 0

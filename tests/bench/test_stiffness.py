@@ -58,20 +58,20 @@ def test_lanczos_finds_the_largest_eigenvalue_of_a_matrix_with_copies_of_it() ->
     turn, _ = torch.linalg.qr(torch.randn(60, 60, generator=g, dtype=torch.float64))
     values = torch.cat([torch.linspace(-30, 8, 57, dtype=torch.float64), torch.tensor([9.0, 9.0, 9.0])])
     matrix = turn @ torch.diag(values) @ turn.T
-    found = largest(
+    top = largest(
         lambda u: matrix @ u, torch.randn(60, generator=g, dtype=torch.float64), tolerance=1e-8, most=60
     )
-    assert found.value == pytest.approx(9.0, abs=1e-8)
-    assert (matrix @ found.vector - 9.0 * found.vector).norm() <= 1e-6
-    assert found.error <= 1e-6
+    assert top.value == pytest.approx(9.0, abs=1e-8)
+    assert (matrix @ top.vector - 9.0 * top.vector).norm() <= 1e-6
+    assert top.error <= 1e-6
 
 
 def test_the_residual_of_lanczos_bounds_its_error() -> None:
     values = torch.linspace(0, 1, 400, dtype=torch.float64) ** 0.5
-    found = largest(lambda u: values * u, torch.ones(400, dtype=torch.float64), tolerance=0.05)
-    assert found.products < 30
-    assert found.value <= 1.0
-    assert (values - found.value).abs().min() <= found.error
+    top = largest(lambda u: values * u, torch.ones(400, dtype=torch.float64), tolerance=0.05)
+    assert top.products < 30
+    assert top.value <= 1.0
+    assert (values - top.value).abs().min() <= top.error
 
 
 def test_ritz_weights_estimate_the_share_of_eigenvalues_above_a_level() -> None:
@@ -85,8 +85,8 @@ def test_lanczos_agrees_with_the_dense_hessian_of_a_scene() -> None:
     apply = exact.product(objective, x, metric)
     matrix = dense(apply, x.shape)
     assert (matrix - matrix.T).abs().max() <= 1e-10 * matrix.abs().max()
-    found = largest(apply, start(metric), tolerance=1e-6, most=200)
-    assert found.value == pytest.approx(float(torch.linalg.eigvalsh(matrix)[-1]), rel=1e-6)
+    top = largest(apply, start(metric), tolerance=1e-6, most=200)
+    assert top.value == pytest.approx(float(torch.linalg.eigvalsh(matrix)[-1]), rel=1e-6)
 
 
 def test_products_by_differences_of_the_fused_step_are_those_of_float64() -> None:

@@ -53,8 +53,8 @@ def study_of(module: str, name: str) -> Study:
     assert spec.loader is not None
     sys.modules[spec.name] = loaded = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(loaded)
-    found: Study = getattr(loaded, name)
-    return found
+    study: Study = getattr(loaded, name)
+    return study
 
 
 @pytest.mark.parametrize(("module", "name"), STUDIES)

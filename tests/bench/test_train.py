@@ -278,15 +278,15 @@ def test_budgets_are_judged_by_all_their_runs(parts: Any, place: Path) -> None:
 def test_cameras_without_points_stand_beside_the_same_capture_with_them(parts: Any, place: Path) -> None:
     without = parts["_train.tables"].without_points
     row = next(row for row in rows_of(place) if row["kind"] == "run") | {"config": "default"}
-    given = [like(row, scene="fox", seed=seed, psnr=30.0 + seed) for seed in (0, 1, 2)]
+    with_points = [like(row, scene="fox", seed=seed, psnr=30.0 + seed) for seed in (0, 1, 2)]
     alone = [like(row, scene="fox-blender", seed=seed, psnr=29.5 + seed) for seed in (0, 1, 2)]
-    text = without([*given, *alone])
+    text = without([*with_points, *alone])
     assert (
         "| fox-blender | 30steps | 3 | 30.50 (29.50 to 31.50) | fox | 31.00 (30.00 to 32.00) | -0.50 |"
         in text
     )
     assert without(alone) == "", "fox was not measured"
-    assert without([*given, *(each | {"code": "newer"} for each in alone)]) == "", (
+    assert without([*with_points, *(each | {"code": "newer"} for each in alone)]) == "", (
         "fox was measured with older code"
     )
 
@@ -319,17 +319,17 @@ def test_the_scan_lies_elsewhere_than_the_still_life(
 
 
 def test_the_share_of_planted_pixels_that_was_found(parts: Any, place: Path) -> None:
-    found = parts["_train.tables"].found
+    disagreements = parts["_train.tables"].disagreements
     row = next(row for row in rows_of(place) if row["kind"] == "run") | {"config": "default"}
-    assert found([row]) == "", "nothing was planted there"
-    seen = {"planted": 0.012, "precision": 0.8, "recall": 0.1}
-    planted = [like(row, seed=seed, disagreement={**seen, "recall": 0.1 * (seed + 1)}) for seed in (0, 1)]
-    older = like(row, code="older", disagreement={**seen, "recall": 0.9})
-    assert found([older, *planted]).endswith(
+    assert disagreements([row]) == "", "nothing was planted there"
+    shares = {"planted": 0.012, "precision": 0.8, "recall": 0.1}
+    planted = [like(row, seed=seed, disagreement={**shares, "recall": 0.1 * (seed + 1)}) for seed in (0, 1)]
+    older = like(row, code="older", disagreement={**shares, "recall": 0.9})
+    assert disagreements([older, *planted]).endswith(
         "| 30steps | 2 | 1.2 (1.2 to 1.2) | 80.0 (80.0 to 80.0) | 15.0 (10.0 to 20.0) |"
     )
     none = like(row, disagreement={"planted": 0.012, "precision": None, "recall": 0.0})
-    assert found([none]).endswith("| 1.2 |  | 0.0 |"), "without outliers there is no precision"
+    assert disagreements([none]).endswith("| 1.2 |  | 0.0 |"), "without outliers there is no precision"
 
 
 def test_switches_are_compared_seed_by_seed_on_the_same_code(parts: Any, place: Path) -> None:
@@ -396,10 +396,10 @@ def test_a_switch_that_the_plan_has_already_is_not_measured(parts: Any, place: P
     assert idle("sh-0", default["plan"])
     assert not idle("sh-3", default["plan"])
     assert not idle("default", default["plan"])
-    wanted = rows.runs_of(
+    runs = rows.runs_of(
         [scene], ["even-light", "default", "no-random-background", "black-background"], [budget], [1, 0]
     )
-    assert [(run.seed, run.config) for run in wanted] == [
+    assert [(run.seed, run.config) for run in runs] == [
         (1, "default"),
         (1, "even-light"),
         (1, "black-background"),

@@ -36,7 +36,7 @@ bench = importlib.import_module("worst")
 def test_scenes_reach_the_image_from_far_off() -> None:
     """Needles of 10^5 pixels whose centres lie as far off draw something, for any direction and depth."""
     draw = np.random.default_rng(0)
-    seen = far = 0
+    visible = far = 0
     for _ in range(60):
         t = draw.random(FAMILIES["one"].numbers)
         t[LENS : LENS + 2], t[LENS + 3], t[LENS + 10] = 0.5, 7 / 8, 0.9
@@ -45,9 +45,9 @@ def test_scenes_reach_the_image_from_far_off() -> None:
             *(getattr(scene, k) for k in ("means", "log_scales", "quats", "logit_opacities", "sh")),
             scene.viewmat, scene.K, SIDE, SIDE, degree=3, backend="reference",
         )  # fmt: skip
-        seen += bool(p.extents.any())
+        visible += bool(p.extents.any())
         far += bool((p.means2d.abs() > 1e4).any())
-    assert seen >= 50
+    assert visible >= 50
     assert far >= 30
 
 

@@ -243,8 +243,8 @@ def open_window(browser: Browser, pixels_per_unit: float) -> Iterator[Open]:
             return visits[-1]
 
         yield open_on
-        found = [text for visit in visits for text in visit.watched.unexpected()]
-    assert not found
+        complaints = [text for visit in visits for text in visit.watched.unexpected()]
+    assert not complaints
 
 
 @pytest.fixture

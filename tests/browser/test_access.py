@@ -42,9 +42,9 @@ def test_every_control_of_the_list_is_reached_by_tab_and_is_seen_to_be(
 ) -> None:
     page.goto("/models?name=still")
     expect(page.locator("#storage table")).to_be_visible()
-    wanted = page.evaluate(COUNT)
-    seen: list[str] = []
-    for _ in range(wanted + 2):
+    count = page.evaluate(COUNT)
+    names: list[str] = []
+    for _ in range(count + 2):
         page.keyboard.press("Tab")
         name, outlined = page.evaluate(
             """() => {
@@ -54,6 +54,6 @@ def test_every_control_of_the_list_is_reached_by_tab_and_is_seen_to_be(
             }"""
         )
         assert outlined, name
-        if name not in seen:
-            seen.append(name)
-    assert len([name for name in seen if not name.startswith("<body")]) >= wanted
+        if name not in names:
+            names.append(name)
+    assert len([name for name in names if not name.startswith("<body")]) >= count

@@ -119,7 +119,7 @@ def snapshots(page: Page, least: int) -> None:
     )
 
 
-def seen(page: Page) -> np.ndarray:
+def live_view(page: Page) -> np.ndarray:
     """What the live view shows, float [H, W, 3]."""
     picture = Image.open(io.BytesIO(page.locator("#live .stage").screenshot(timeout=60_000)))
     return np.asarray(picture.convert("RGB"), np.float64) / 255.0
@@ -142,7 +142,7 @@ def test_the_scene_is_watched_while_it_trains(service: Up, capture: str, open_wi
     page.goto(f"/jobs/{job_id}")
     expect(page.get_by_role("heading", level=1)).to_have_text("watched")
     snapshots(page, 1)
-    first = seen(page)
+    first = live_view(page)
     assert first.std() > 0.05
     expect(page.locator("#stages")).to_contain_text("left of this stage")
     expect(page.locator("#warnings")).to_contain_text("belongs to no photo by name")
@@ -157,12 +157,12 @@ def test_the_scene_is_watched_while_it_trains(service: Up, capture: str, open_wi
     turned, shown = box.get_attribute("data-pose"), int(box.get_attribute("data-snapshots") or 0)
     snapshots(page, shown + 1)
     assert box.get_attribute("data-pose") == turned
-    assert seen(page).std() > 0.05
+    assert live_view(page).std() > 0.05
     # Loaded anew, the page shows the scene from where it began, and leads back there by a button and by a key.
     page.reload()
     snapshots(page, 1)
     expect(box).to_have_attribute("data-pose", before or "")
-    assert seen(page).std() > 0.05
+    assert live_view(page).std() > 0.05
     view = page.locator("#live .view").first
     for back in (page.get_by_role("button", name="Start view").click, lambda: view.press("Home")):
         view.press("ArrowLeft", delay=200)
@@ -228,7 +228,7 @@ def test_a_whole_job_is_watched_from_its_beginning_to_its_model(
     expect(page.locator("#curve tbody tr")).to_have_count(len(rows))
     page.get_by_role("button", name="Cameras and points").click()
     expect(page.locator("#live .placement")).to_have_attribute("data-cameras", str(still_life.COUNT))
-    assert seen(page).std() > 0.01
+    assert live_view(page).std() > 0.01
 
 
 def test_a_queued_job_says_its_place_and_a_job_is_cancelled_by_keyboard(
@@ -367,17 +367,17 @@ def test_a_scene_that_comes_before_its_cameras_is_seen_from_where_they_are(
           }, Promise.resolve(new LiveScene(document.body.appendChild(document.createElement("div")), id)));
           const [late, early] = [await scene(["draw", "cameras"]), await scene(["cameras", "draw"])];
           const pose = () => late.boxes.scene.dataset.pose;
-          const [framed, wanted] = [pose(), early.boxes.scene.dataset.pose];
+          const [framed, target] = [pose(), early.boxes.scene.dataset.pose];
           const far = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -99], [0, 0, 0, 1]];
           late.view.setCamera({ ...late.view.getCamera(), camera_to_world: far });
           const away = pose();
           late.homeButton.click();
-          return [framed, pose(), wanted, away];
+          return [framed, pose(), target, away];
         }""",
         model.id,
     )
-    framed, home, wanted, away = poses
-    assert framed == home == wanted != away
+    framed, home, target, away = poses
+    assert framed == home == target != away
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

@@ -40,10 +40,10 @@ def address(request: pytest.FixtureRequest, service: Up) -> Iterator[str]:
 
 def outside(page: Page, address: str) -> list[str]:
     """A list that grows by the addresses outside of the service's for which the page asks."""
-    found: list[str] = []
+    addresses: list[str] = []
     inside = (f"{address}/", "blob:", "data:")
-    page.on("request", lambda asked: None if asked.url.startswith(inside) else found.append(asked.url))
-    return found
+    page.on("request", lambda asked: None if asked.url.startswith(inside) else addresses.append(asked.url))
+    return addresses
 
 
 def test_photos_are_sent_and_the_job_is_followed(

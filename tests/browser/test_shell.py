@@ -135,7 +135,7 @@ def test_the_policy_stops_scripts_of_others(visit: Visit) -> None:
 
 
 def test_the_small_model_is_whole(service: Up, model: SmallModel) -> None:
-    found = service.http.get(f"/v1/models/{model.id}").json()
-    assert 100 < found["gaussians"] <= 3000
+    record = service.http.get(f"/v1/models/{model.id}").json()
+    assert 100 < record["gaussians"] <= 3000
     cameras = service.http.get(f"/v1/models/{model.id}/cameras").json()["cameras"]
     assert {camera["split"] for camera in cameras} == {"train", "test"}

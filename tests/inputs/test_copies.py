@@ -21,11 +21,11 @@ from tests.support.paths import DATA
 
 @pytest.mark.slow
 def test_resized_copies_are_left_out_and_named(built: Build, tmp_path: Path) -> None:
-    found = prepare(built("copies"), None, tmp_path)
+    prepared = prepare(built("copies"), None, tmp_path)
     names = [f"still_{k:04d}.jpg" for k in range(1, 31)]
-    assert [photo.name for photo in found.photos] == names
-    assert dict(found.skipped) == {f"web/{name}": f"it shows the same as {name}" for name in names}
-    assert any("30 photos show the same as another one" in warning for warning in found.warnings)
+    assert [photo.name for photo in prepared.photos] == names
+    assert dict(prepared.skipped) == {f"web/{name}": f"it shows the same as {name}" for name in names}
+    assert any("30 photos show the same as another one" in warning for warning in prepared.warnings)
 
 
 @pytest.mark.parametrize(
@@ -48,8 +48,8 @@ def test_no_photo_of_a_walk_is_a_copy_by_its_content(capture: str, count: int) -
 def test_no_photo_of_a_walk_with_cameras_is_a_copy(capture: str, count: int) -> None:
     if not (DATA / capture).is_dir():
         pytest.skip(f"{DATA / capture} is not here.")
-    given = posed.find(DATA / capture)
-    assert given is not None
-    scene = given.load()
+    poses = posed.find(DATA / capture)
+    assert poses is not None
+    scene = poses.load()
     assert len(scene.views) == count
     assert same_photos(scene) == {}

@@ -17,8 +17,8 @@ pytestmark = pytest.mark.slow
 
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda example: example.what)
 def test_an_input_gets_its_answer(example: Example) -> None:
-    found = answer(example.make)
-    assert found.kind == example.kind, found.said
+    reply = answer(example.make)
+    assert reply.kind == example.kind, reply.said
 
 
 def test_the_page_of_inputs_is_that_of_the_program() -> None:

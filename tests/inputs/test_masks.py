@@ -25,18 +25,18 @@ HIDDEN = "30 of 30 photos have a mask; the masks hide 21% of their pixels."
 def test_masks_of_other_programs_are_used_and_measured(built: Build, tmp_path: Path, kind: str) -> None:
     folder = built(*kind.split())
     masks = folder / "masks"
-    found = prepare(folder / "images", masks if masks.is_dir() else None, tmp_path)
-    assert len(found.photos) == 30
-    assert len({photo.mask for photo in found.photos} - {None}) == 30
-    assert (found.skipped, found.notes, found.warnings) == ((), (HIDDEN,), ())
+    prepared = prepare(folder / "images", masks if masks.is_dir() else None, tmp_path)
+    assert len(prepared.photos) == 30
+    assert len({photo.mask for photo in prepared.photos} - {None}) == 30
+    assert (prepared.skipped, prepared.notes, prepared.warnings) == ((), (HIDDEN,), ())
     upload = find_files(folder)
     assert (upload.count(Role.images), upload.count(Role.masks), upload.ignored) == (30, 30, ())
 
 
 def test_masks_whose_white_hides_are_questioned(built: Build) -> None:
-    found = posed.find(built("picture-kinds") / "inverted")
-    assert found is not None
-    scene = found.load()
+    poses = posed.find(built("picture-kinds") / "inverted")
+    assert poses is not None
+    scene = poses.load()
     assert all(view.mask is not None for view in scene.views)
     (warning,) = scene.warnings
     assert "hide 91% of their pixels" in warning

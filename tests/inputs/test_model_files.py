@@ -94,8 +94,8 @@ def test_the_orbit_of_a_guitar_shows_it_upright() -> None:
     scene = registry.read(GUITAR).gaussians
     # The first camera of a circle and the opposite one see the front and the back.
     for camera in list(orbit_cameras(None, scene, OrbitRequest(seconds=1), UP))[::12]:
-        seen = scene.means.double().numpy() @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-        across, down = (seen[:, :2] / seen[:, 2:]).T
+        points = scene.means.double().numpy() @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+        across, down = (points[:, :2] / points[:, 2:]).T
         top, bottom = np.quantile(down, [0.01, 0.99])
         assert bottom - top > 2 * np.ptp(np.quantile(across, [0.01, 0.99]))
         neck, body = across[down < top + (bottom - top) / 3], across[down > bottom - (bottom - top) / 3]

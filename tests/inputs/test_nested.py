@@ -37,9 +37,9 @@ def test_the_folder_a_zip_and_an_upload_of_it_have_its_cameras(built: Build, tmp
 
 
 def load(capture: Path) -> Scene:
-    found = posed.find(capture)
-    assert found is not None
-    return found.load()
+    poses = posed.find(capture)
+    assert poses is not None
+    return poses.load()
 
 
 def cameras(scene: Scene) -> dict[str, list[float]]:

@@ -17,9 +17,9 @@ from tests.inputs.conftest import Build
 
 @pytest.mark.slow
 def test_photos_stored_upside_down_are_read_as_their_cameras_saw_them(built: Build) -> None:
-    given = posed.find(built("orientation-180"))
-    assert given is not None
-    scene = given.load()
+    poses = posed.find(built("orientation-180"))
+    assert poses is not None
+    scene = poses.load()
     assert sum(view.other is not None for view in scene.views) == 15
     scene = orientation.decided(scene)
     assert len(scene.views) == 30

@@ -64,11 +64,11 @@ def test_the_frames_have_the_colours_of_sdr(made: Path, name: str, tmp_path: Pat
     assert any(VIDEOS[name] in warning for warning in prepared.warnings)
     photo = prepared.photos[FRAMES // 2]
     with Image.open(photo.path) as frame:
-        found = np.asarray(frame, float)
+        image = np.asarray(frame, float)
     truth = np.load(made / "vid.npy")[int(photo.path.stem.rpartition("_")[2])]
-    assert found.shape == truth.shape
-    assert 10 * math.log10(255**2 / ((found - truth) ** 2).mean()) > 33.5
-    spread = [float((np.max(each, 2) - np.min(each, 2)).mean()) for each in (found, truth.astype(float))]
+    assert image.shape == truth.shape
+    assert 10 * math.log10(255**2 / ((image - truth) ** 2).mean()) > 33.5
+    spread = [float((np.max(each, 2) - np.min(each, 2)).mean()) for each in (image, truth.astype(float))]
     assert spread[0] == pytest.approx(spread[1], rel=0.05)
 
 
@@ -87,11 +87,11 @@ def test_the_cameras_are_those_of_the_frames(made: Path, tmp_path: Path) -> None
     )
     assert len(scene.views) >= FRAMES - 1
     numbers = [int(view.image.stem.rpartition("_")[2]) for view in scene.views]
-    found = np.stack([view.camera.viewmat[:3, :3] for view in scene.views])
+    rotations = np.stack([view.camera.viewmat[:3, :3] for view in scene.views])
     truth = np.stack([cameras()[number].viewmat[:3, :3] for number in numbers])
-    u, _, v = np.linalg.svd(np.einsum("nji,njk->ik", found, truth))
+    u, _, v = np.linalg.svd(np.einsum("nji,njk->ik", rotations, truth))
     common = u @ np.diag([1, 1, np.linalg.det(u @ v)]) @ v
-    cosines = (np.einsum("nij,jk,nik->n", found, common, truth) - 1) / 2
+    cosines = (np.einsum("nij,jk,nik->n", rotations, common, truth) - 1) / 2
     errors = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
     assert np.median(errors) < 0.2
     assert errors.max() < 1.0

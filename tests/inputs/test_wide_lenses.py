@@ -14,15 +14,15 @@ from tests.inputs.conftest import Build
 
 @pytest.mark.slow
 def test_panoramas_with_cameras_are_read(built: Build) -> None:
-    given = posed.find(built("equirectangular"))
-    assert given is not None
-    scene = given.load()
+    poses = posed.find(built("equirectangular"))
+    assert poses is not None
+    scene = poses.load()
     assert all(faces.is_panorama(view) for view in scene.views)
     assert len(faces.cut(scene).views) == 6 * len(scene.views)
 
 
 @pytest.mark.slow
 def test_panoramas_without_cameras_are_known(built: Build, tmp_path: Path) -> None:
-    found = prepare(built("equirectangular") / "images", None, tmp_path)
-    assert all(photo.is_panorama for photo in found.photos)
-    assert "taken for 360-degree panoramas" in found.warnings[0]
+    prepared = prepare(built("equirectangular") / "images", None, tmp_path)
+    assert all(photo.is_panorama for photo in prepared.photos)
+    assert "taken for 360-degree panoramas" in prepared.warnings[0]

@@ -131,9 +131,9 @@ def test_fuzz_the_update_of_the_cpu(
             d_color = torch.randn(image.shape, generator=g) * 10 ** (
                 size - decades * torch.rand(image.shape, generator=g)
             )
-            found = rows(step.gradients(d_color))
-            largest = largest.maximum(found.abs())
-            p, grads, m, v = (x.split(COLUMNS, 1) for x in (want[0], found.double(), *want[1:]))
+            slopes = rows(step.gradients(d_color))
+            largest = largest.maximum(slopes.abs())
+            p, grads, m, v = (x.split(COLUMNS, 1) for x in (want[0], slopes.double(), *want[1:]))
             assert reference.adam_(p, grads, m, v, RATES, step=number, beta2=beta2) == 0
             assert step.backward_update(d_color, rates=rates, step=number) == 0
         after = [rows(step.parameters()), *step.moments()]

@@ -33,7 +33,7 @@ class Search:
     turn: Tensor
     shift: Tensor
 
-    def given(self, dtype: torch.dtype = torch.float32) -> tuple[Tensor, ...]:
+    def tensors(self, dtype: torch.dtype = torch.float32) -> tuple[Tensor, ...]:
         fields = (self.image, self.rays, self.patches, self.inverse_depths, self.turn, self.shift)
         return tuple(x.to(dtype) for x in fields)
 
@@ -84,7 +84,7 @@ KINDS = ["shifted", "turned", "towards the camera", "behind", "flat", "one colou
 
 def correlate(search: Search, backend: str, dtype: torch.dtype = torch.float32) -> Tensor:
     with use(backend) as op:
-        return ops.correlate(*search.given(dtype), margin=MARGIN, least_variance=FLOOR, backend=op)
+        return ops.correlate(*search.tensors(dtype), margin=MARGIN, least_variance=FLOOR, backend=op)
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class Exact:
 @cache
 def exact(kind: str) -> Exact:
     search = _search(kind)
-    image, rays, patches, inverse, turn, shift = search.given(torch.float64)
+    image, rays, patches, inverse, turn, shift = search.tensors(torch.float64)
     height, width = image.shape
     count, middle = rays.shape[1], rays.shape[1] // 2
     points = (rays @ turn.T)[:, None] + (inverse[:, None] * shift)[:, None]
@@ -111,16 +111,16 @@ def exact(kind: str) -> Exact:
     moved = off[..., :2] / z[..., None] + pixels.abs() * (off[..., 2] / z + 3 * EPS)[..., None] + EPS
     grid = 2 * pixels / torch.tensor([width, height]) - 1
     n, d, m, _ = grid.shape
-    seen = torch.nn.functional.grid_sample(
+    samples = torch.nn.functional.grid_sample(
         image[None, None], grid.reshape(1, n * d, m, 2), padding_mode="border", align_corners=False
     ).reshape(n, d, m)
     steps = [image.diff(dim=axis).abs().max() for axis in (0, 1)]
     wrong = max(steps) * moved.sum(-1).clamp_max(width + height) + 6 * EPS * image.abs().max()
-    mean = seen.mean(-1, keepdim=True)
-    deviation = (seen - mean).square().mean(-1).clamp_min(FLOOR).sqrt()
-    scores = ((seen - mean) * patches[:, None]).sum(-1) / (deviation * count**0.5)
+    mean = samples.mean(-1, keepdim=True)
+    deviation = (samples - mean).square().mean(-1).clamp_min(FLOOR).sqrt()
+    scores = ((samples - mean) * patches[:, None]).sum(-1) / (deviation * count**0.5)
     # Through the product and through the deviation, the largest error of a sample; then the rounding of their sums.
-    spread = (seen - seen[:, :, middle, None]).abs().amax(-1) / deviation
+    spread = (samples - samples[:, :, middle, None]).abs().amax(-1) / deviation
     allowed = 2 * wrong.amax(-1) / deviation + (count + 8) * EPS * (spread + 2 * spread**2) + 8 * EPS
     # The mean of a patch is 0 but for rounding, so that it does not matter from where its grey values count.
     allowed += patches.sum(1).abs()[:, None] * spread / count**0.5
@@ -184,14 +184,14 @@ def test_what_is_behind_the_camera_is_not_seen_where_its_line_passes(backend: st
 @pytest.mark.parametrize("backend", BUILDS)
 def test_threads_do_not_show(backend: str) -> None:
     search = _search("turned")
-    before, found = torch.get_num_threads(), []
+    before, scores = torch.get_num_threads(), []
     try:
         for threads in (1, 2):
             torch.set_num_threads(threads)
-            found.append(correlate(search, backend))
+            scores.append(correlate(search, backend))
     finally:
         torch.set_num_threads(before)
-    assert torch.equal(*found)
+    assert torch.equal(*scores)
 
 
 @pytest.mark.parametrize("backend", ["reference", *BUILDS])
@@ -207,7 +207,7 @@ def test_a_bad_ray_spoils_its_own_patch_alone(backend: str, value: float) -> Non
 
 @pytest.mark.parametrize("backend", ["reference", *BUILDS])
 def test_no_patches_and_no_depths_give_no_scores(backend: str) -> None:
-    image, rays, patches, inverse, turn, shift = _search("shifted").given()
+    image, rays, patches, inverse, turn, shift = _search("shifted").tensors()
     none = Search(image, rays[:0], patches[:0], inverse, turn, shift)
     assert correlate(none, backend).shape == (0, 37)
     assert correlate(Search(image, rays, patches, inverse[:0], turn, shift), backend).shape == (40, 0)
@@ -230,9 +230,9 @@ def test_no_patches_and_no_depths_give_no_scores(backend: str) -> None:
 )
 def test_bad_arguments_are_named(change: dict[str, Any], names: str) -> None:
     search = _search("shifted")
-    given = {
+    arguments = {
         "image": search.image, "rays": search.rays, "patches": search.patches, "turn": search.turn,
         "inverse_depths": search.inverse_depths, "shift": search.shift, "margin": MARGIN, "least_variance": FLOOR,
     }  # fmt: skip
     with pytest.raises((TypeError, ValueError), match=names):
-        ops.correlate(**{**given, **change}, backend="cpu")
+        ops.correlate(**{**arguments, **change}, backend="cpu")

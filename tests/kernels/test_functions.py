@@ -36,14 +36,14 @@ def committed(function: Function, build: str) -> dict[str, Any]:
 @pytest.mark.parametrize("function", FUNCTIONS, ids=lambda f: f.name)
 def test_no_error_is_larger_than_the_table_says(function: Function, build: str) -> None:
     row = committed(function, build)
-    found = measure(build, function, STRIDE)
+    sample = measure(build, function, STRIDE)
     figures = ["ulp"]
     if (function.name, build) in ESTIMATE_BOUNDS:
         row = {**row, "ulp": max(row["ulp"], ESTIMATE_BOUNDS[function.name, build])}
     else:
         figures += ["relative", "absolute"]
         # Of the whole and of a sample spread evenly over it: by chance within 1 % for thousands of arguments.
-        assert found["rms_ulp"] <= 1.03 * row["rms_ulp"]
+        assert sample["rms_ulp"] <= 1.03 * row["rms_ulp"]
     # The sample may miss the worst arguments, so those of the table are tried with their neighbours.
     library = load(build)
     for figure in figures:
@@ -53,7 +53,7 @@ def test_no_error_is_larger_than_the_table_says(function: Function, build: str) 
             for low, high in function.span.intervals
         ]
         near = errors(library, function.name, around)
-        for name, largest in ((figure, getattr(near, figure)), (figure, found[figure])):
+        for name, largest in ((figure, getattr(near, figure)), (figure, sample[figure])):
             # The exact value is known to a billionth of an ulp.
             assert largest <= row[figure] * (1 + 1e-8), (
                 f"{name}: {largest:.6g}, the table has {row[figure]:.6g}"
@@ -65,8 +65,8 @@ def test_no_error_is_larger_than_the_table_says(function: Function, build: str) 
 @pytest.mark.parametrize(("x", "end"), [(-1e30, -87), (-1000, -87), (-87.5, -87), (88.5, 88), (700, 88)])
 def test_e_to_the_x_stays_at_the_ends_of_its_range(build: str, x: float, end: float) -> None:
     first = place(x)
-    found = errors(load(build), "exp", [(first, first + 1)])
-    assert found.absolute == pytest.approx(abs(math.exp(x) - math.exp(end)), rel=1e-6, abs=0)
+    error = errors(load(build), "exp", [(first, first + 1)])
+    assert error.absolute == pytest.approx(abs(math.exp(x) - math.exp(end)), rel=1e-6, abs=0)
 
 
 @pytest.mark.parametrize("function", FUNCTIONS, ids=lambda f: f.name)

@@ -77,17 +77,17 @@ def test_threads_and_order_do_not_show(backend: str) -> None:
     points = torch.randn(40_000, 3, generator=torch.Generator().manual_seed(10))
     shuffle = torch.randperm(40_000, generator=torch.Generator().manual_seed(11))
     before = torch.get_num_threads()
-    found = []
+    distances = []
     try:
         with use(backend) as op:
             for threads in (1, 2):
                 torch.set_num_threads(threads)
-                found.append(ops.knn(points, backend=op))
-            found.append(ops.knn(points[shuffle], backend=op)[torch.argsort(shuffle)])
+                distances.append(ops.knn(points, backend=op))
+            distances.append(ops.knn(points[shuffle], backend=op)[torch.argsort(shuffle)])
     finally:
         torch.set_num_threads(before)
-    assert torch.equal(found[0], found[1])
-    assert torch.equal(found[0], found[2])
+    assert torch.equal(distances[0], distances[1])
+    assert torch.equal(distances[0], distances[2])
 
 
 @pytest.mark.parametrize("backend", ["reference", *backends()])

@@ -123,14 +123,14 @@ def test_what_a_mask_hides_does_not_matter(backend: str) -> None:
     poisoned, other = color.clone(), photo.clone()
     poisoned[hidden], other[hidden] = float("nan"), 77
     device = where(backend)
-    found = []
+    results = []
     with use(backend) as op:
         for c, p in ((color, photo), (poisoned, other)):
             leaf = c.to(device).requires_grad_()
             value = ops.loss(leaf, p.to(device), mask=mask.to(device), backend=op)
-            found.append((value.detach(), torch.autograd.grad(value, leaf)[0]))
-    assert torch.equal(found[0][0], found[1][0])
-    assert torch.equal(found[0][1], found[1][1])
+            results.append((value.detach(), torch.autograd.grad(value, leaf)[0]))
+    assert torch.equal(results[0][0], results[1][0])
+    assert torch.equal(results[0][1], results[1][1])
 
 
 @pytest.mark.parametrize("backend", ["reference", *backends()])
@@ -151,7 +151,7 @@ def test_an_empty_mask_gives_zero(backend: str) -> None:
 def test_kept_statistics_and_threads_change_nothing(backend: str) -> None:
     color, photo = pair(97, 600)
     mask = half_mask(97, 600)
-    found = []
+    results = []
     before = torch.get_num_threads()
     try:
         with use(backend) as op:
@@ -160,12 +160,12 @@ def test_kept_statistics_and_threads_change_nothing(backend: str) -> None:
                 torch.set_num_threads(threads)
                 leaf = color.clone().requires_grad_()
                 value = ops.loss(leaf, photo, mask=mask, stats=stats, backend=op)
-                found.append((value.detach(), torch.autograd.grad(value, leaf)[0]))
+                results.append((value.detach(), torch.autograd.grad(value, leaf)[0]))
     finally:
         torch.set_num_threads(before)
-    for value, gradient in found[1:]:
-        assert torch.equal(value, found[0][0])
-        assert torch.equal(gradient, found[0][1])
+    for value, gradient in results[1:]:
+        assert torch.equal(value, results[0][0])
+        assert torch.equal(gradient, results[0][1])
 
 
 def test_the_definition_is_wangs() -> None:

@@ -51,22 +51,22 @@ def test_the_splat_that_leaves_half_gives_the_depth(
     backend: str, opacities: list[float], depths: list[float], expected: float
 ) -> None:
     with use(backend) as op:
-        found = ops.median_depth(discs(opacities, depths), listed(len(depths)), 16, 16, backend=op)
-    assert found.shape == (16, 16)
-    assert (found == expected).all()
+        depth = ops.median_depth(discs(opacities, depths), listed(len(depths)), 16, 16, backend=op)
+    assert depth.shape == (16, 16)
+    assert (depth == expected).all()
 
 
 @pytest.mark.parametrize("backend", ["reference", *BUILDS])
 def test_a_tilted_splat_has_the_depths_of_a_plane(backend: str) -> None:
     tilts = torch.tensor([[0.0625, -0.125]])
     with use(backend) as op:
-        found = ops.median_depth(discs([0.9], [10.0]), listed(1), 16, 16, tilts=tilts, backend=op)
+        depth = ops.median_depth(discs([0.9], [10.0]), listed(1), 16, 16, tilts=tilts, backend=op)
     offset = torch.arange(16) + 0.5 - 8.0
     nearness = 1.0 - 0.0625 * offset[None, :] + 0.125 * offset[:, None]
     beyond = nearness <= 1e-3  # behind the plane's horizon
     assert beyond.any()
     assert not beyond.all()
-    torch.testing.assert_close(found, torch.where(beyond, 0.0, 10.0 / nearness), rtol=1e-6, atol=0)
+    torch.testing.assert_close(depth, torch.where(beyond, 0.0, 10.0 / nearness), rtol=1e-6, atol=0)
 
 
 @pytest.mark.parametrize("backend", BUILDS)
@@ -75,8 +75,8 @@ def test_depth_is_the_definitions(name: str, backend: str) -> None:
     case = CASES[name]()
     projected, bins, tilts = fields_of(case)
     with use(backend) as op:
-        found = ops.median_depth(projected, bins, case.width, case.height, tilts=tilts, backend=op)
-    agrees(name, case, found, projected, bins, tilts)
+        depth = ops.median_depth(projected, bins, case.width, case.height, tilts=tilts, backend=op)
+    agrees(name, case, depth, projected, bins, tilts)
 
 
 @pytest.mark.parametrize("backend", ["reference", *BUILDS])
@@ -91,15 +91,15 @@ def test_a_bad_tilt_takes_no_other_splats_pixels(backend: str, bad: float) -> No
         bad,
     )  # the first gives the pixels of this splat another depth than any other
     with use(backend) as op:
-        clean, marked, found = (
+        clean, marked, spoilt = (
             ops.median_depth(projected, bins, case.width, case.height, tilts=each, backend=op)
             for each in (flat, marking, poisoned)
         )
     others = clean == marked
     assert others.any()
     assert not others.all()
-    assert torch.equal(found[others], clean[others])
-    assert not found.isnan().any()
+    assert torch.equal(spoilt[others], clean[others])
+    assert not spoilt.isnan().any()
 
 
 @pytest.mark.parametrize("backend", ["reference", *BUILDS])
@@ -107,8 +107,8 @@ def test_another_transmittance_is_passed_elsewhere(backend: str) -> None:
     splats, lists = discs([0.2, 0.4, 0.9], [1.0, 2.0, 3.0]), listed(3)  # 0.8, 0.48 and 0.048 are left
     with use(backend) as op:
         for transmittance, depth in ((0.9, 1.0), (0.7, 2.0), (0.4, 3.0)):
-            found = ops.median_depth(splats, lists, 16, 16, transmittance=transmittance, backend=op)
-            assert (found == depth).all()
+            image = ops.median_depth(splats, lists, 16, 16, transmittance=transmittance, backend=op)
+            assert (image == depth).all()
 
 
 @pytest.mark.parametrize("transmittance", [0.0, 0.05, 1.5, float("nan")])

@@ -194,7 +194,7 @@ def test_a_phase_of_a_million_turns_is_its_fraction(backend: str) -> None:
 def test_the_number_of_threads_changes_no_bit(backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
     p, waves = scene(300, seed=8)
     lists = ops.bin(p, WIDTH, HEIGHT, backend="reference")
-    found = []
+    results = []
     for threads in (1, 2, 5):
         with use(backend) as op:
             module = importlib.import_module("splatmill_worker.kernels.cpu.composite")
@@ -211,9 +211,9 @@ def test_the_number_of_threads_changes_no_bit(backend: str, monkeypatch: pytest.
 
             with monkeypatch.context() as patch:
                 patch.setattr(module, "engine", Engine(vars(module)["engine"], threads))
-                found.append(differentiated(p, waves, lists, op, torch.float32))
-    for other in found[1:]:
-        for a, b in zip(found[0], other, strict=True):
+                results.append(differentiated(p, waves, lists, op, torch.float32))
+    for other in results[1:]:
+        for a, b in zip(results[0], other, strict=True):
             assert torch.equal(a, b)
 
 

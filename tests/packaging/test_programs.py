@@ -80,7 +80,7 @@ def test_a_missing_program_skips_a_test_and_fails_it_where_all_are_installed(
 
 @pytest.mark.skipif(not Path("/var/lib/dpkg/status").is_file(), reason="Debian's packages are asked")
 def test_under_ci_tests_find_the_programs_of_the_list_and_no_others(tmp_path: Path) -> None:
-    wanted = [Path(program(name)).name for name in DECLARED]
+    programs = [Path(program(name)).name for name in DECLARED]
     folder, mine = tmp_path / "links", tmp_path / "mine"
     mine.mkdir()
     for name in ("redis-server", "promtool"):
@@ -90,7 +90,7 @@ def test_under_ci_tests_find_the_programs_of_the_list_and_no_others(tmp_path: Pa
     links = [sys.executable, str(ROOT / ".ci/links.py"), str(folder)]
     subprocess.run(links, check=True, env=os.environ | {"PATH": path}, timeout=120)
     made = {link.name for link in folder.iterdir()}
-    assert made >= {*wanted, "sh", "bash", "grep", "awk", "tar", "cc", "ld"}
+    assert made >= {*programs, "sh", "bash", "grep", "awk", "tar", "cc", "ld"}
     assert made.isdisjoint({"redis-server", "valkey-server", "node", "npm", "ffmpeg", "colmap"})
     (tmp_path / "a.cpp").write_text("int main() { return 7; }")
     build = "c++ a.cpp -o a && ./a"
@@ -112,9 +112,9 @@ def images() -> list[str]:
 
 
 def test_images_are_named_by_version_and_digest() -> None:
-    found = images()
+    names = images()
     assert len(DOCKERFILES) == 2
-    assert {image.split(":")[0] for image in found} == {"redis", "caddy", "debian"}
-    for image in found:
+    assert {image.split(":")[0] for image in names} == {"redis", "caddy", "debian"}
+    for image in names:
         assert re.fullmatch(r"[a-z]+:\S*\d[\d.]{4,}\S*@sha256:[0-9a-f]{64}", image)
-    assert len(set(found)) == 3, "an image is the same one everywhere"
+    assert len(set(names)) == 3, "an image is the same one everywhere"

@@ -66,11 +66,11 @@ def test_the_wheels_have_one_version_and_their_licence(wheels: dict[str, Path]) 
     client = metadata(wheels["client"])
     text = (ROOT / "LICENSE").read_text()
     for name, folder in PARTS.items():
-        found = metadata(wheels[folder])
-        assert found.metadata["Name"] == name
-        assert found.version == client.version
-        assert found.read_text("licenses/LICENSE") == text
-        assert str(found.metadata["Description"]).startswith(f"# {name}\n")
+        package = metadata(wheels[folder])
+        assert package.metadata["Name"] == name
+        assert package.version == client.version
+        assert package.read_text("licenses/LICENSE") == text
+        assert str(package.metadata["Description"]).startswith(f"# {name}\n")
 
 
 def test_the_server_contains_its_web_page_and_the_licences_of_others(wheels: dict[str, Path]) -> None:

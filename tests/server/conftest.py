@@ -76,7 +76,7 @@ def lines() -> Iterator[CapturingLogger]:
     before = structlog.get_config()
     captured = CapturingLogger()
     structlog.configure(
-        processors=[structlog.stdlib.add_log_level, lambda _, __, found: ((), found)],
+        processors=[structlog.stdlib.add_log_level, lambda _, __, fields: ((), fields)],
         wrapper_class=structlog.make_filtering_bound_logger(logging.DEBUG),
         logger_factory=lambda *_: captured,
         cache_logger_on_first_use=False,

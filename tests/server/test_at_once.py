@@ -77,9 +77,9 @@ def apps(
         "outgoing_allow": peer.url.removeprefix("http://"),
         "renderer_url": "http://127.0.0.1:1",
     }
-    found = [serve(**settings), serve(**settings)]
-    store_model(found[0].service, MODEL)
-    return found
+    pair = [serve(**settings), serve(**settings)]
+    store_model(pair[0].service, MODEL)
+    return pair
 
 
 def test_links_to_a_model(apps: list[ServedApp], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -108,8 +108,8 @@ def test_imports_that_have_not_ended(
 def test_orbit_videos(apps: list[ServedApp], limit: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(orbits.Orbits, limit, 3)
     path = f"/v1/models/{MODEL}/orbits"
-    found = statuses(apps, lambda http, number: http.post(path, json={"fps": 5 + number}))
-    assert found == {202: 3, 409: AT_ONCE - 3}
+    counts = statuses(apps, lambda http, number: http.post(path, json={"fps": 5 + number}))
+    assert counts == {202: 3, 409: AT_ONCE - 3}
     assert len(apps[0].http.get(path).json()["orbits"]) == 3
 
 

@@ -23,16 +23,16 @@ def line(message: str, *arguments: object, **more: object) -> dict[str, object]:
     record.__dict__.update(more)
     text = log_lines.JsonLines().format(record)
     assert "\n" not in text
-    found: dict[str, object] = json.loads(text)
-    return found
+    fields: dict[str, object] = json.loads(text)
+    return fields
 
 
 def test_a_line_names_what_is_bound_until_it_is_taken_away() -> None:
     log_lines.bind(worker="a-1", job="j", request="r", attempt=2)
-    found = line("of %s\nand %d", "words", 3)
-    assert found["event"] == "of words\nand 3"
-    assert (found["level"], found["logger"]) == ("warning", "splatmill.test")
-    assert [found[name] for name in ("worker", "job", "attempt", "request")] == ["a-1", "j", 2, "r"]
+    fields = line("of %s\nand %d", "words", 3)
+    assert fields["event"] == "of words\nand 3"
+    assert (fields["level"], fields["logger"]) == ("warning", "splatmill.test")
+    assert [fields[name] for name in ("worker", "job", "attempt", "request")] == ["a-1", "j", 2, "r"]
     log_lines.bind(job=None, attempt=None)
     assert {"job", "attempt"}.isdisjoint(line("idle"))
     assert line("idle", request="of this line alone")["request"] == "of this line alone"
@@ -42,8 +42,8 @@ def test_a_traceback_is_a_field() -> None:
     try:
         raise ValueError("two\nlines")
     except ValueError as error:
-        found = line("it failed", exc_info=(type(error), error, error.__traceback__))
-    assert str(found["exception"]).endswith("ValueError: two\nlines")
+        fields = line("it failed", exc_info=(type(error), error, error.__traceback__))
+    assert str(fields["exception"]).endswith("ValueError: two\nlines")
 
 
 def test_formats_have_names() -> None:

@@ -196,9 +196,9 @@ def peak(pid: int) -> int:
 
 def modes(folder: Path) -> dict[str, str]:
     """The modes of all folders and files in and below a folder, by kind."""
-    found = [folder, *folder.rglob("*")]
+    paths = [folder, *folder.rglob("*")]
     return {
-        kind: ",".join(sorted({f"{path.stat().st_mode & 0o777:o}" for path in found if is_kind(path)}))
+        kind: ",".join(sorted({f"{path.stat().st_mode & 0o777:o}" for path in paths if is_kind(path)}))
         for kind, is_kind in (("folders", Path.is_dir), ("files", Path.is_file))
     }
 

@@ -71,7 +71,7 @@ def test_processes_are_put_together_as_their_metric_is_counted(query: str) -> No
 
 def test_what_a_running_server_tells_is_documented(app: ServedApp) -> None:
     app.job()
-    told = {found.name for found in text_string_to_metric_families(app.http.get("/metrics").text)}
+    told = {metric.name for metric in text_string_to_metric_families(app.http.get("/metrics").text)}
     documented = {name.removesuffix("_total") for name in metrics.names()}
     # prometheus_client adds to each counter and histogram when it began.
     assert {name.removesuffix("_created") for name in told} <= documented | {"splatmill_jobs"}

@@ -43,9 +43,9 @@ def test_made_up_requests_get_described_answers(serve: Serve) -> None:
     app = serve(api_key="s3cret")  # a stored key that a made-up request makes does not close the server
     schema = schemathesis.openapi.from_url(f"{str(app.http.base_url).rstrip('/')}/openapi.json")
     tried = 0
-    for found in schema.get_all_operations():
-        assert isinstance(found, Ok)
-        operation: Any = found.ok()
+    for result in schema.get_all_operations():
+        assert isinstance(result, Ok)
+        operation: Any = result.ok()
         if operation.path.endswith("/events"):
             continue  # An endless answer; test_events reads it.
 

@@ -96,17 +96,17 @@ def test_addresses_and_methods_that_do_not_exist(app: ServedApp) -> None:
 
 def test_every_answer_carries_its_request_id(app: ServedApp) -> None:
     assert app.http.get("/healthz", headers={"X-Request-ID": "abc-1"}).headers["x-request-id"] == "abc-1"
-    for given in ("x" * 65, "a\tb", ""):
-        made = app.http.get("/healthz", headers={"X-Request-ID": given}).headers["x-request-id"]
-        assert made != given
+    for request_id in ("x" * 65, "a\tb", ""):
+        made = app.http.get("/healthz", headers={"X-Request-ID": request_id}).headers["x-request-id"]
+        assert made != request_id
         assert len(made) == 16
 
 
 def test_a_key_is_asked_for_in_the_header_and_nowhere_else(serve: Serve) -> None:
     app = serve(api_key="s3cret")
     assert app.http.get("/v1/jobs").status_code == 200
-    for given in ("", "Bearer wrong", "s3cret", "Bearer é"):
-        answer = app.http.get("/v1/jobs?api_key=s3cret", headers={b"Authorization": given.encode()})
+    for header in ("", "Bearer wrong", "s3cret", "Bearer é"):
+        answer = app.http.get("/v1/jobs?api_key=s3cret", headers={b"Authorization": header.encode()})
         problem(answer, 401, "unauthorized")
         assert answer.headers["www-authenticate"] == "Bearer"
         assert "s3cret" not in answer.text

@@ -27,7 +27,7 @@ from splatmill_server.background import deliveries
 from splatmill_server.base.leases import exclusive
 from splatmill_server.base.problems import ProblemError
 from tests.support.served_app import Serve, ServedApp, problem, stored
-from tests.support.servers.scripted_server import Reply, ScriptedServer, Seen, scripted_server
+from tests.support.servers.scripted_server import Reply, Request, ScriptedServer, scripted_server
 from tests.support.waiting import wait_for
 
 
@@ -84,8 +84,8 @@ def ended(app: ServedApp, state: str = "failed") -> str:
     return job_id
 
 
-def verified(made: Any, seen: Seen) -> Any:
-    return verify_webhook(seen.headers, seen.body, made["secret"])
+def verified(made: Any, request: Request) -> Any:
+    return verify_webhook(request.headers, request.body, made["secret"])
 
 
 @pytest.mark.parametrize("state", ["succeeded", "failed", "cancelled"])
@@ -96,15 +96,19 @@ def test_each_end_of_a_job_arrives_once_and_signed(app: ServedApp, peer: Scripte
     [delivery] = over(app, made)
     for _ in range(3):
         app.service.reaper.tick()
-    [seen] = peer.seen
-    assert (seen.method, seen.path, seen.headers["content-type"]) == ("POST", "/hook", "application/json")
-    payload = verified(made, seen)
+    [request] = peer.requests
+    assert (request.method, request.path, request.headers["content-type"]) == (
+        "POST",
+        "/hook",
+        "application/json",
+    )
+    payload = verified(made, request)
     shown = app.http.get(f"/v1/jobs/{job_id}").json()
     assert payload["type"] == f"job.{state}"
     assert payload["timestamp"] == shown["finished_at"]
     assert Job.model_validate(payload["data"]) == Job.model_validate(shown)
     assert (delivery["job"], delivery["event"], delivery["state"]) == (job_id, f"job.{state}", "delivered")
-    assert delivery["message"] == seen.headers["webhook-id"]
+    assert delivery["message"] == request.headers["webhook-id"]
     assert [(entry["status"], entry["answer"]) for entry in delivery["attempts"]] == [(200, "thanks")]
     # The next generation of the job has an end of its own.
     if state != "succeeded":
@@ -112,8 +116,11 @@ def test_each_end_of_a_job_arrives_once_and_signed(app: ServedApp, peer: Scripte
         app.http.post(f"/v1/jobs/{job_id}/cancel")
         app.service.reaper.tick()
         over(app, made, 2)
-        assert [verified(made, seen)["type"] for seen in peer.seen] == [f"job.{state}", "job.cancelled"]
-        assert len({seen.headers["webhook-id"] for seen in peer.seen}) == 2
+        assert [verified(made, request)["type"] for request in peer.requests] == [
+            f"job.{state}",
+            "job.cancelled",
+        ]
+        assert len({request.headers["webhook-id"] for request in peer.requests}) == 2
 
 
 def test_a_webhook_is_told_what_it_asked_for(app: ServedApp, peer: ScriptedServer) -> None:
@@ -167,10 +174,10 @@ def test_what_is_not_taken_is_sent_again_with_the_same_id(app: ServedApp, peer: 
     assert [entry.get("status") for entry in attempts] == [500, None, 302, 204]
     assert attempts[0]["answer"] == "x" * 500
     assert "connection to 127.0.0.1 failed" in attempts[1]["error"]
-    assert len({seen.headers["webhook-id"] for seen in peer.seen}) == 1
-    assert len({seen.body for seen in peer.seen}) == 1
-    for seen in peer.seen:
-        verified(made, seen)
+    assert len({request.headers["webhook-id"] for request in peer.requests}) == 1
+    assert len({request.body for request in peer.requests}) == 1
+    for request in peer.requests:
+        verified(made, request)
     counted = app.http.get("/metrics").text
     assert 'splatmill_webhook_attempts_total{result="retried"} 3.0' in counted
     assert 'splatmill_webhook_attempts_total{result="delivered"} 1.0' in counted
@@ -197,18 +204,18 @@ def test_the_pauses_grow_and_retry_after_is_followed(
     assert 499 < pause(1) < 510
     hurry(app, made)
     assert 899 < pause(2) < 1110
-    assert len(peer.seen) == 2
+    assert len(peer.requests) == 2
 
 
 def hurry(app: ServedApp, made: Any) -> None:
     """Make the next attempt of the only delivery due now."""
     service = app.service.webhooks
     [shown] = log(app, made)
-    found = service.get_delivery(made["id"], shown["id"])
-    assert found is not None
-    found = found.model_copy(update={"next_at": datetime.now(UTC) - timedelta(seconds=1)})
-    service.save_delivery(found)
-    service.mark(found)
+    delivery = service.get_delivery(made["id"], shown["id"])
+    assert delivery is not None
+    delivery = delivery.model_copy(update={"next_at": datetime.now(UTC) - timedelta(seconds=1)})
+    service.save_delivery(delivery)
+    service.mark(delivery)
 
 
 def test_a_delivery_that_another_process_makes_is_not_asked_for_all_the_time(
@@ -230,7 +237,7 @@ def test_a_delivery_that_another_process_makes_is_not_asked_for_all_the_time(
     for _ in range(20):
         assert [entry["state"] for entry in log(app, made)] == ["pending"]
     assert len(asked) <= before + 2  # of the pause that had begun, and of one that had ended
-    assert peer.seen == []
+    assert peer.requests == []
 
 
 def test_an_address_that_fails_for_long_is_disabled_with_its_reason(
@@ -242,10 +249,10 @@ def test_an_address_that_fails_for_long_is_disabled_with_its_reason(
     ended(app)
     [delivery] = over(app, made)
     assert (delivery["state"], len(delivery["attempts"])) == ("failed", 4)
-    found = app.http.get(address).json()
-    assert found["disabled_at"] is not None
-    assert "4 attempts" in found["disabled_reason"]
-    assert "status 500" in found["disabled_reason"]
+    hook = app.http.get(address).json()
+    assert hook["disabled_at"] is not None
+    assert "4 attempts" in hook["disabled_reason"]
+    assert "status 500" in hook["disabled_reason"]
     # Nothing is sent to it until it is enabled again.
     second = ended(app)
     wait_for(lambda: f"watched/{second}.json" not in stored(app))
@@ -256,7 +263,7 @@ def test_an_address_that_fails_for_long_is_disabled_with_its_reason(
     assert (repeated.status_code, repeated.json()["state"]) == (202, "pending")
     [delivery] = over(app, made)
     assert (delivery["state"], len(delivery["attempts"])) == ("delivered", 5)
-    assert len({seen.headers["webhook-id"] for seen in peer.seen}) == 1
+    assert len({request.headers["webhook-id"] for request in peer.requests}) == 1
 
 
 def test_an_address_that_is_gone_is_disabled_at_once(app: ServedApp, peer: ScriptedServer) -> None:
@@ -276,16 +283,16 @@ def test_a_new_secret_signs_beside_the_former_one_for_a_day(app: ServedApp, peer
     assert new["secret"] != made["secret"]
     ended(app)
     over(app, made)
-    verified(made, peer.seen[0])
-    verified(new, peer.seen[0])
+    verified(made, peer.requests[0])
+    verified(new, peer.requests[0])
     # After the day, only the new one signs.
     record = app.service.webhooks.get(made["id"])
     record.secrets[1].until = datetime.now(UTC)
     app.service.webhooks._write(record)
     ended(app)
     over(app, made, 2)
-    verified(new, peer.seen[1])
-    assert len(peer.seen[1].headers["webhook-signature"].split()) == 1
+    verified(new, peer.requests[1])
+    assert len(peer.requests[1].headers["webhook-signature"].split()) == 1
 
 
 def test_a_pending_delivery_survives_a_restart_and_the_loss_of_redis(
@@ -295,23 +302,23 @@ def test_a_pending_delivery_survives_a_restart_and_the_loss_of_redis(
     first = serve(outgoing_allow=allow)
     made = webhook(first, peer)
 
-    async def never(_: Seen) -> Reply:
+    async def never(_: Request) -> Reply:
         await asyncio.sleep(60)
         return Reply()
 
     peer.answer = never
     ended(first)
-    wait_for(lambda: len(peer.seen) == 1)
+    wait_for(lambda: len(peer.requests) == 1)
     # The process dies in the middle of the attempt, and Redis with it.
     for task in list(first.service.deliveries._running.values()):
         task.cancel()
-    wait_for(lambda: first.service.deliveries._running == {} or len(peer.seen) > 1)
+    wait_for(lambda: first.service.deliveries._running == {} or len(peer.requests) > 1)
     first.redis.flushall()
     peer.answer = lambda _: Reply()
     second = serve(outgoing_allow=allow)
     [delivery] = over(second, made)
     assert delivery["state"] == "delivered"
-    assert len({seen.headers["webhook-id"] for seen in peer.seen}) == 1
+    assert len({request.headers["webhook-id"] for request in peer.requests}) == 1
 
 
 def test_two_processes_send_each_end_once(serve: Serve, peer: ScriptedServer) -> None:
@@ -327,7 +334,7 @@ def test_two_processes_send_each_end_once(serve: Serve, peer: ScriptedServer) ->
     second.service.reaper.tick()
     first.service.reaper.tick()
     over(second, made, 6)
-    assert sorted(verified(made, seen)["data"]["id"] for seen in peer.seen) == sorted(jobs)
+    assert sorted(verified(made, request)["data"]["id"] for request in peer.requests) == sorted(jobs)
 
 
 def test_an_end_is_not_skipped_when_storage_fails_or_the_job_is_deleted_or_restarted_at_once(
@@ -350,7 +357,10 @@ def test_an_end_is_not_skipped_when_storage_fails_or_the_job_is_deleted_or_resta
     app.http.post(f"/v1/jobs/{job_id}/cancel")
     assert app.http.delete(f"/v1/jobs/{job_id}").status_code == 204
     over(app, made, 2)
-    assert sorted(verified(made, seen)["type"] for seen in peer.seen) == ["job.cancelled", "job.failed"]
+    assert sorted(verified(made, request)["type"] for request in peer.requests) == [
+        "job.cancelled",
+        "job.failed",
+    ]
     assert not any(path.startswith("watched") for path in stored(app))
 
 
@@ -365,8 +375,8 @@ def test_the_end_of_a_job_that_redis_lost_is_told_once_it_is_restored(
     app.service.jobs.restore([finished, kept])
     app.service.reaper.tick()
     over(app, made, 1)
-    assert [verified(made, seen)["data"]["id"] for seen in peer.seen] == [finished]
-    assert verified(made, peer.seen[0])["type"] == "job.succeeded"
+    assert [verified(made, request)["data"]["id"] for request in peer.requests] == [finished]
+    assert verified(made, peer.requests[0])["type"] == "job.succeeded"
     assert row.read(app.redis, kept) is not None
 
 
@@ -378,10 +388,10 @@ def test_the_end_of_a_job_that_is_restored_while_it_is_retired_is_told(
     job = app.job()
     app.begin(job)
     jobs, read = app.service.jobs, row.read
-    retire, found = jobs.retire, itertools.count()
+    retire, reads = jobs.retire, itertools.count()
 
     def lost_at_first(connection: redis.Redis, job_id: str) -> JobRow | None:
-        return None if job_id == job and next(found) == 0 else read(connection, job_id)
+        return None if job_id == job and next(reads) == 0 else read(connection, job_id)
 
     with monkeypatch.context() as patch:
         patch.setattr(jobs, "retire", lambda job_id: None)  # the process that follows ends comes too late
@@ -391,7 +401,7 @@ def test_the_end_of_a_job_that_is_restored_while_it_is_retired_is_told(
         retire(job)
     app.service.reaper.tick()
     over(app, made, 1)
-    assert verified(made, peer.seen[0])["data"]["id"] == job
+    assert verified(made, peer.requests[0])["data"]["id"] == job
 
 
 def test_old_deliveries_are_deleted_and_unreadable_records_harm_no_other(
@@ -435,7 +445,7 @@ def test_a_pause_that_cannot_be_read_does_not_keep_an_attempt_from_being_counted
     ended(app)
     [delivery] = over(app, made)
     assert (delivery["state"], len(delivery["attempts"])) == ("failed", 4)
-    assert len(peer.seen) == 4
+    assert len(peer.requests) == 4
 
 
 def test_an_error_that_nobody_expected_counts_as_an_attempt(
@@ -469,10 +479,10 @@ def test_an_attempt_that_cannot_be_counted_is_not_made(app: ServedApp, peer: Scr
     app.service.webhooks.storage.put = full  # type: ignore[assignment]  # a full disk
     ended(app)
     wait_for(lambda: len(tried) >= 3)
-    assert peer.seen == []
+    assert peer.requests == []
     app.service.webhooks.storage.put = refusing  # type: ignore[method-assign]  # room again
     [delivery] = over(app, made)
-    assert len(delivery["attempts"]) == len(peer.seen) == 4
+    assert len(delivery["attempts"]) == len(peer.requests) == 4
 
 
 def test_of_two_changes_of_a_webhook_at_once_neither_is_lost(app: ServedApp, peer: ScriptedServer) -> None:
@@ -490,9 +500,9 @@ def test_of_two_changes_of_a_webhook_at_once_neither_is_lost(app: ServedApp, pee
             assert not end.done()
         rotated = rotation.result(20)
         end.result(20)
-    found = service.get(made["id"])
-    assert (found.name, found.disabled_reason) == ("renamed", "gone")
-    assert [secret.value for secret in found.secrets] == [rotated.secret, made["secret"]]
+    hook = service.get(made["id"])
+    assert (hook.name, hook.disabled_reason) == ("renamed", "gone")
+    assert [secret.value for secret in hook.secrets] == [rotated.secret, made["secret"]]
 
 
 def test_a_webhook_that_is_deleted_while_it_is_changed_stays_deleted(

@@ -223,9 +223,9 @@ def test_the_idle_service_is_small(service: Up) -> None:
 def test_other_users_of_the_machine_may_read_nothing_of_it(own_service: Up) -> None:
     own_service.start()
     own_service.submit(steps=1)
-    found = [own_service.data, *own_service.data.rglob("*")]
-    assert {path.stat().st_mode & 0o077 for path in found} == {0}
-    assert sorted(path.name for path in found if path.is_socket()) == ["redis.sock", "renderer.sock"]
+    paths = [own_service.data, *own_service.data.rglob("*")]
+    assert {path.stat().st_mode & 0o077 for path in paths} == {0}
+    assert sorted(path.name for path in paths if path.is_socket()) == ["redis.sock", "renderer.sock"]
 
 
 def test_connections_that_rest_are_kept_longer_than_clients_use_them(service: Up) -> None:

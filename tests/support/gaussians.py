@@ -16,26 +16,26 @@ def some_gaussians(n: int, degree: int, seed: int = 0) -> Gaussians:
     return Gaussians(normal(n, 3), normal(n, 3) - 3, normal(n, 4), (normal(n) * 2).clamp(-5, 5), sh)
 
 
-def matched(found: Gaussians, wanted: Gaussians) -> Gaussians:
-    """The rows of `wanted` that are nearest to those of `found`, which each is once."""
-    nearest = torch.cdist(found.means.double(), wanted.means.double()).argmin(dim=1)
-    assert len(nearest.unique()) == found.count == wanted.count
-    return wanted.select(nearest)
+def matched(actual: Gaussians, expected: Gaussians) -> Gaussians:
+    """The rows of `expected` that are nearest to those of `actual`, which each is once."""
+    nearest = torch.cdist(actual.means.double(), expected.means.double()).argmin(dim=1)
+    assert len(nearest.unique()) == actual.count == expected.count
+    return expected.select(nearest)
 
 
-def differences(found: Gaussians, wanted: Gaussians) -> dict[str, float]:
+def differences(actual: Gaussians, expected: Gaussians) -> dict[str, float]:
     """The greatest difference of each parameter, row by row. That of `quats` is 1 - |cosine|, as q and -q are the same
     turn; that of opacities is between opacities, not logits."""
-    assert found.degree == wanted.degree
-    assert found.count == wanted.count
-    mine, theirs = (torch.nn.functional.normalize(g.quats.double(), dim=1) for g in (found, wanted))
+    assert actual.degree == expected.degree
+    assert actual.count == expected.count
+    mine, theirs = (torch.nn.functional.normalize(g.quats.double(), dim=1) for g in (actual, expected))
     return {
-        "means": float((found.means - wanted.means).abs().max()),
-        "log_scales": float((found.log_scales - wanted.log_scales).abs().max()),
+        "means": float((actual.means - expected.means).abs().max()),
+        "log_scales": float((actual.log_scales - expected.log_scales).abs().max()),
         "quats": float((1 - (mine * theirs).sum(dim=1).abs()).max()),
         "opacities": float(
-            (torch.sigmoid(found.logit_opacities) - torch.sigmoid(wanted.logit_opacities)).abs().max()
+            (torch.sigmoid(actual.logit_opacities) - torch.sigmoid(expected.logit_opacities)).abs().max()
         ),
-        "dc": float((found.sh[:, 0] - wanted.sh[:, 0]).abs().max()),
-        "harmonics": float((found.sh[:, 1:] - wanted.sh[:, 1:]).abs().max()) if found.degree else 0.0,
+        "dc": float((actual.sh[:, 0] - expected.sh[:, 0]).abs().max()),
+        "harmonics": float((actual.sh[:, 1:] - expected.sh[:, 1:]).abs().max()) if actual.degree else 0.0,
     }

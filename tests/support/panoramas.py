@@ -115,8 +115,8 @@ def fisheye(
     across = np.sinc(angle / np.pi)
     rays = np.stack([x * across, y * across, np.cos(angle)], axis=-1)
     photo = np.zeros((height, width, 3), np.uint8)
-    seen = angle <= np.radians(degrees) / 2
-    photo[seen] = seen_along(scene, viewmat, rays[seen], round(focal * np.pi / 2 * 1.3), samples)
+    visible = angle <= np.radians(degrees) / 2
+    photo[visible] = seen_along(scene, viewmat, rays[visible], round(focal * np.pi / 2 * 1.3), samples)
     return photo
 
 

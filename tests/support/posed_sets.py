@@ -76,9 +76,9 @@ def transforms(path: Path, of: list[Any] | None = None, change: Callable[[str], 
 
 
 def loaded(capture: Path) -> Scene:
-    found = posed.find(capture)
-    assert found is not None
-    return found.load()
+    source = posed.find(capture)
+    assert source is not None
+    return source.load()
 
 
 def check(scene: Scene, expected: dict[str, int]) -> None:

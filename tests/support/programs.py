@@ -28,7 +28,7 @@ DECLARED: dict[str, tuple[tuple[str, ...], str, str]] = {
 def program(name: str) -> str:
     """Return the path of a program of `.ci/programs`, under any of its names."""
     names, package, _ = DECLARED[name]
-    path = next((found for each in names if (found := shutil.which(each))), None)
+    path = next((file for each in names if (file := shutil.which(each))), None)
     return path or _lacking(f"{name} is not on PATH (Debian: apt-get install {package})")
 
 

@@ -59,11 +59,11 @@ class ServedApp:
 
     def say(self, job_id: str, *said: Event, attempt: int | None = None) -> None:
         """Append events in the name of the attempt that began last."""
-        found = row.read(self.redis, job_id)
-        assert found is not None
+        record = row.read(self.redis, job_id)
+        assert record is not None
         for event in said:
             number = self._attempts[job_id] if attempt is None else attempt
-            events.append(self.redis, job_id, found.generation, number, event)
+            events.append(self.redis, job_id, record.generation, number, event)
 
     def finish(self, job_id: str) -> None:
         """End a job with a small but whole model."""

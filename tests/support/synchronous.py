@@ -155,12 +155,12 @@ def _renamed(annotation: str) -> str:
 def _call(callee: str, function: Function) -> str:
     """The call of the asynchronous function with the parameters of the synchronous one."""
     positional = len(function.args.args) - 1
-    given = [
+    arguments = [
         ("" if place < positional else f"{name}=") + ("report" if name == "on_progress" else name)
         for place, name in enumerate(_names(function))
     ]
-    given += [f"**{function.args.kwarg.arg}"] if function.args.kwarg else []
-    return f"{callee}({', '.join(given)})"
+    arguments += [f"**{function.args.kwarg.arg}"] if function.args.kwarg else []
+    return f"{callee}({', '.join(arguments)})"
 
 
 def _names(function: Function) -> list[str]:

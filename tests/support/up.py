@@ -153,13 +153,13 @@ class Up:
     def children(self, *words: str) -> list[psutil.Process]:
         """The children whose command lines hold all these words."""
         assert self.process is not None
-        found = []
+        processes = []
         for child in psutil.Process(self.process.pid).children():
             with contextlib.suppress(psutil.Error):  # one that has just ended has no command line
                 line = " ".join(child.cmdline())
                 if all(word in line for word in words):
-                    found.append(child)
-        return found
+                    processes.append(child)
+        return processes
 
     def child(self, *words: str) -> int:
         """The pid of the child whose command line holds all these words, once there is one."""

@@ -80,24 +80,24 @@ def needed(wheels: Iterable[Path], extras: Mapping[str, str]) -> dict[str, Distr
     `extras` maps names of the parts to the extra that is asked of them.
     """
     ours: dict[str, Distribution] = {
-        canonicalize_name(found.metadata["Name"]): found for found in map(metadata, wheels)
+        canonicalize_name(part.metadata["Name"]): part for part in map(metadata, wheels)
     }
-    found: dict[str, Distribution] = {}
-    seen: set[tuple[str, frozenset[str]]] = set()
+    others: dict[str, Distribution] = {}
+    known: set[tuple[str, frozenset[str]]] = set()
     waiting = [(name, frozenset({extras[name]} if name in extras else ())) for name in ours]
     while waiting:
         name, asked = waiting.pop()
-        if (name, asked) in seen:
+        if (name, asked) in known:
             continue
-        seen.add((name, asked))
+        known.add((name, asked))
         if name not in ours:
-            found[name] = distribution(name)
-        for text in (ours | found)[name].requires or []:
+            others[name] = distribution(name)
+        for text in (ours | others)[name].requires or []:
             requirement = Requirement(text)
             marker = requirement.marker
             if marker is None or any(marker.evaluate({"extra": extra}) for extra in asked | {""}):
                 waiting.append((canonicalize_name(requirement.name), frozenset(requirement.extras)))
-    return found
+    return others
 
 
 def environment(folder: Path, *wheels: Path, **extras: str) -> Path:

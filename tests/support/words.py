@@ -26,9 +26,6 @@ NOT_READ = (
 )
 """Files that may hold the turns."""
 
-OLD_NAMES = (".ci/", "docs/", "server/bench/", "server/setup.py", "server/web/", "tests/", "worker/")
-"""Folders in which names are not checked yet."""
-
 _TURN = re.compile("|".join(r"\b" + r"[\s#/*]+".join(turn.split()) + r"\b" for turn in TURNS), re.IGNORECASE)
 """Also over the end of a line, where the next begins as a comment does."""
 
@@ -39,12 +36,10 @@ def problems(name: str, text: str) -> Iterator[str]:
     """Each banned turn and name in the file `name` with the content `text`, as `path:line: what`."""
     for match in _TURN.finditer(text):
         yield f"{name}:{_line(text, match)}: the turn {' '.join(match[0].split())!r}"
-    if name.startswith(OLD_NAMES):
-        return
     if name.endswith(".py"):
         for node in ast.walk(ast.parse(text)):
             for each in _defined(node):
-                if each.lstrip("_") in NAMES:
+                if each.lstrip("_").lower() in NAMES:
                     yield f"{name}:{getattr(node, 'lineno', 1)}: the name {each!r}"
     elif name.endswith(".js"):
         for match in _JS_NAME.finditer(text):

@@ -46,8 +46,8 @@ def test_what_is_wrong_is_found_and_advised_on(tmp_path: Path) -> None:
     wrong = {"redis": "bad", "storage": "bad", "kernels": "warning"}
     assert {topic: findings[topic]["verdict"] for topic in wrong} == wrong
     assert all(findings[topic]["advice"] for topic in wrong)
-    assert "nothing.sock" in findings["redis"]["seen"]
-    assert "ftp://nowhere" in findings["storage"]["seen"]
+    assert "nothing.sock" in findings["redis"]["result"]
+    assert "ftp://nowhere" in findings["storage"]["result"]
 
 
 def test_a_redis_with_faults_in_lua_is_warned_of(tmp_path: Path) -> None:
@@ -57,6 +57,6 @@ def test_a_redis_with_faults_in_lua_is_warned_of(tmp_path: Path) -> None:
     status, findings = doctor(tmp_path, SPLATMILL_REDIS_SERVER=str(old))
     assert status == 0
     assert findings["redis"]["verdict"] == "warning"
-    assert "Redis 7.2.10" in findings["redis"]["seen"]
-    assert "CVE-2025-49844" in findings["redis"]["seen"]
+    assert "Redis 7.2.10" in findings["redis"]["result"]
+    assert "CVE-2025-49844" in findings["redis"]["result"]
     assert "only the service" in findings["redis"]["advice"]

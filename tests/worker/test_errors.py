@@ -24,7 +24,7 @@ def raised_codes() -> dict[str, str]:
         for name, kind in vars(errors).items()
         if isinstance(kind, type) and issubclass(kind, WorkerError)
     }
-    found = {}
+    codes = {}
     for path in (ROOT / "worker" / "splatmill_worker").rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
             if not isinstance(node, ast.Call) or not node.args:
@@ -34,8 +34,8 @@ def raised_codes() -> dict[str, str]:
             if (called in tree or (called == "__init__" and path.name == "errors.py")) and isinstance(
                 code, ast.Constant
             ):
-                found[str(code.value)] = path.name
-    return found
+                codes[str(code.value)] = path.name
+    return codes
 
 
 def test_every_code_is_in_the_table_of_problems() -> None:
@@ -50,8 +50,8 @@ def test_every_code_of_the_table_is_given_somewhere() -> None:
     parts = ("client/splatmill", "server/splatmill_server", "worker/splatmill_worker")
     table = ROOT / "client/splatmill/schema/problems.py"
     texts = [p.read_text() for part in parts for p in (ROOT / part).rglob("*.py") if p != table]
-    given = {code for code in PROBLEMS if any(f'"{code}"' in text for text in texts)}
-    assert PROBLEMS.keys() - given - {code_for_status(status.value) for status in HTTPStatus} == set()
+    codes = {code for code in PROBLEMS if any(f'"{code}"' in text for text in texts)}
+    assert PROBLEMS.keys() - codes - {code_for_status(status.value) for status in HTTPStatus} == set()
 
 
 def test_a_code_that_is_not_given_any_more_is_still_read() -> None:

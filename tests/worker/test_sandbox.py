@@ -118,9 +118,9 @@ def test_it_dies_first_when_memory_runs_out_and_has_no_rights_of_root(
     status = Path(f"/proc/{child}/status").read_text()
     search_only = 1 << 2
     for name in ("CapPrm", "CapEff"):
-        found = re.search(rf"^{name}:\s*(\w+)$", status, re.MULTILINE)
-        assert found is not None
-        assert int(found[1], 16) & ~search_only == 0
+        match = re.search(rf"^{name}:\s*(\w+)$", status, re.MULTILINE)
+        assert match is not None
+        assert int(match[1], 16) & ~search_only == 0
     assert re.search(r"^Seccomp:\s*2$", status, re.MULTILINE)
     assert re.search(r"^NoNewPrivs:\s*1$", status, re.MULTILINE)
     assert [os.readlink(f"/proc/{child}/fd/{number}").partition(":")[0] for number in (0, 1, 2)] == [

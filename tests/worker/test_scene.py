@@ -48,8 +48,10 @@ def test_unprojecting_undoes_projecting() -> None:
     camera = scene_of(["a"], offset=40.0).views[0].camera
     random = np.random.default_rng(2)
     points = camera.to_world(random.uniform((-3.0, -3.0, 0.1), (3.0, 3.0, 9.0), (50, 3)))
-    seen = camera.project(points)
-    np.testing.assert_allclose(camera.unproject(seen.columns, seen.rows, seen.depths), points, rtol=1e-12)
+    projection = camera.project(points)
+    np.testing.assert_allclose(
+        camera.unproject(projection.columns, projection.rows, projection.depths), points, rtol=1e-12
+    )
     np.testing.assert_allclose(camera.to_world(camera.to_camera(points)), points, rtol=1e-12)
 
 

@@ -135,20 +135,20 @@ def values(includes: str, *names: str) -> dict[str, int]:
     ran = subprocess.run(command, input=source, capture_output=True, text=True, check=False)
     if ran.returncode:
         pytest.skip(f"the headers of the kernel are not installed: {ran.stderr.strip().splitlines()[0]}")
-    found = {}
+    numbers = {}
     # The name itself is replaced too, so that the lines are told apart by their order.
     for name, line in zip(names, re.findall(r"^VALUE .* = (.*)$", ran.stdout, re.MULTILINE), strict=True):
         if re.fullmatch(r"[\d\sa-fA-FxX|+()]+", line):
-            found[name] = int(eval(re.sub(r"\b0([0-7]+)\b", r"0o\1", line)))
-    return found
+            numbers[name] = int(eval(re.sub(r"\b0([0-7]+)\b", r"0o\1", line)))
+    return numbers
 
 
 def number_of_calls(machine: str, names: Sequence[str]) -> dict[str, int]:
     """The numbers of the kernel's calls on an architecture, by name."""
     if machine == "x86_64" and platform.machine() != "x86_64":
         pytest.skip("the headers of x86_64 are part of its own machines alone")
-    found = values(CALLS[machine], *(f"__NR_{name}" for name in names))
-    return {name.removeprefix("__NR_"): number for name, number in found.items()}
+    numbers = values(CALLS[machine], *(f"__NR_{name}" for name in names))
+    return {name.removeprefix("__NR_"): number for name, number in numbers.items()}
 
 
 def table(machine: str) -> dict[str, int | None]:
@@ -199,8 +199,8 @@ def test_the_numbers_are_those_of_the_kernel(machine: str) -> None:
 @pytest.mark.parametrize("machine", seccomp.ARCHITECTURES)
 def test_the_values_of_arguments_are_those_of_the_kernel(machine: str) -> None:
     def of(*names: str) -> list[int]:
-        found = values(CONSTANTS, *names)
-        return [found[name] for name in names]
+        numbers = values(CONSTANTS, *names)
+        return [numbers[name] for name in names]
 
     assert of(f"AUDIT_ARCH_{machine.upper()}") == [seccomp.ARCHITECTURES[machine][1]]
     assert sum(of("O_ACCMODE", "O_CREAT", "O_TRUNC", "__O_TMPFILE")) == seccomp._READ_ONLY
@@ -238,12 +238,12 @@ def test_of_all_numbers_those_of_the_table_are_allowed(machine: str) -> None:
     own = {number: name for name, number in table(machine).items() if number is not None}
     for number in range(1024):
         name = own.get(number)
-        found = verdict(machine, number)
+        answer = verdict(machine, number)
         if name is None:
             absent = number == seccomp._CLONE3 or number > seccomp._NEWEST
-            assert found == (ENOSYS if absent else EPERM), number
+            assert answer == (ENOSYS if absent else EPERM), number
         elif name not in limited:
-            assert found == ALLOW, name
+            assert answer == ALLOW, name
     for number in (0x40000000, 0x40000001, 0x7FFFFFFF, -1):
         assert verdict(machine, number) == KILL
     for other in {0x40000003, 0x40000028, 0, *(two for _, two in seccomp.ARCHITECTURES.values())}:
@@ -266,9 +266,9 @@ def test_arguments_decide_where_a_call_is_allowed_in_part(machine: str) -> None:
     def of(name: str, *arguments: int) -> bool:
         number = calls[name]
         assert number is not None
-        found = verdict(machine, number, *arguments)
-        assert found in (ALLOW, EPERM)
-        return found == ALLOW
+        answer = verdict(machine, number, *arguments)
+        assert answer in (ALLOW, EPERM)
+        return answer == ALLOW
 
     close_on_exec, directory = 0o2000000, 0o200000 if machine == "x86_64" else 0o40000
     here = 2**64 - 100

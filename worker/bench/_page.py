@@ -18,9 +18,9 @@ def filled(page: str, blocks: Mapping[str, str]) -> str:
     """The page with the text of every block between its comments. Raises ValueError where they are missing."""
     for name, text in blocks.items():
         begin = f"<!-- from rows: {name} -->\n"
-        before, found, rest = page.partition(begin)
+        before, opening, rest = page.partition(begin)
         _, closed, after = rest.partition(END)
-        if not (found and closed):
+        if not (opening and closed):
             raise ValueError(f"The page has no place for {name!r}: {begin.strip()} and {END} are not in it.")
         page = f"{before}{begin}{text}\n{END}{after}"
     return page

@@ -59,9 +59,9 @@ def name(panel: Axes, x: str = "", y: str = "", title: str = "", *, log: str = "
             put(text, fontsize=size)
 
 
-def middles(panel: Axes, found: dict[float, list[float]], style: str = "-", **look: Any) -> None:
+def middles(panel: Axes, values: dict[float, list[float]], style: str = "-", **look: Any) -> None:
     """A line through the medians of the values at each place."""
-    panel.plot(list(found), [statistics.median(x) for x in found.values()], style, **look)
+    panel.plot(list(values), [statistics.median(x) for x in values.values()], style, **look)
 
 
 def save(figure: Figure, path: Path, footer: str) -> None:

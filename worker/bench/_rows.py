@@ -57,8 +57,8 @@ def origin(*parts: str) -> Row:
 def footer(rows: list[Row]) -> str:
     """The line under a figure or table: the machines, versions and commits of its rows."""
 
-    def distinct(found: Iterable[str], between: str) -> str:
-        return between.join(dict.fromkeys(found))
+    def distinct(texts: Iterable[str], between: str) -> str:
+        return between.join(dict.fromkeys(texts))
 
     machines = distinct((row["machine"] for row in rows), "; ")
     versions = distinct((", ".join(f"{k} {v}" for k, v in row["versions"].items()) for row in rows), "; ")
@@ -103,9 +103,9 @@ def read(name: str) -> list[Row]:
     return lines(HERE / "results" / f"{name}.jsonl")
 
 
-def of(rows: Iterable[Row], **wanted: object) -> list[Row]:
+def of(rows: Iterable[Row], **fields: object) -> list[Row]:
     """The rows whose fields have the given values."""
-    return [row for row in rows if all(row.get(name) == value for name, value in wanted.items())]
+    return [row for row in rows if all(row.get(name) == value for name, value in fields.items())]
 
 
 def distinct(rows: Iterable[Row], name: str) -> list[Any]:

@@ -87,10 +87,10 @@ def fox(longest_side: int, n: int | None = None) -> Scene | None:
     from splatmill_worker.scene import split
     from splatmill_worker.sfm import posed
 
-    found = posed.find(DATA)
-    if found is None:
+    poses = posed.find(DATA)
+    if poses is None:
         return None
-    world = found.load()
+    world = poses.load()
     train, _ = split(world)
     views = []
     for photo in load_views(train, longest_side):

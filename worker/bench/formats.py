@@ -96,8 +96,8 @@ def measure(
             return
         storage = _stored(outcome.out, workdir / "storage")
         torch.set_num_threads(1)
-        for found in rows(storage, workdir):
-            yield rounded(row | {"outcome": "written"} | found)
+        for figures in rows(storage, workdir):
+            yield rounded(row | {"outcome": "written"} | figures)
 
 
 def _formats(storage: Storage, folder: Path) -> Iterator[Row]:
@@ -134,7 +134,7 @@ def _levels(storage: Storage, folder: Path) -> Iterator[Row]:
 
 def _from_afar(model: LoadedModel, gaussians: Gaussians, cameras: list[Camera], times: int) -> float:
     """Mean PSNR, dB, of pictures that are `times` as small, against means over pixels of those of the model."""
-    found = []
+    psnrs = []
     for camera in cameras:
         width, height = camera.width // times, camera.height // times
         small = replace(
@@ -146,8 +146,8 @@ def _from_afar(model: LoadedModel, gaussians: Gaussians, cameras: list[Camera], 
             shown = render(gaussians, small, antialias=model.antialias).color.clamp(0, 1)
         near = near[: height * times, : width * times]
         truth = near.reshape(height, times, width, times, 3).mean((1, 3))
-        found.append(psnr(float((shown - truth).double().square().mean())))
-    return sum(found) / len(found)
+        psnrs.append(psnr(float((shown - truth).double().square().mean())))
+    return sum(psnrs) / len(psnrs)
 
 
 def _written(storage: Storage, key: str, folder: Path) -> Row:

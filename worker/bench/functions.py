@@ -154,9 +154,9 @@ def summary(rows: list[Row]) -> list[str]:
         "| --- " * (3 + len(builds)) + "|",
     ]
     for function in FUNCTIONS:
-        found = {row["build"]: row["ulp"] for row in measured(of(rows, function=function.name))}
+        by_build = {row["build"]: row["ulp"] for row in measured(of(rows, function=function.name))}
         documented = [bound for (name, _), bound in ESTIMATE_BOUNDS.items() if name == function.name]
-        cells = [*(found[build] for build in builds), max([*found.values(), *documented])]
+        cells = [*(by_build[build] for build in builds), max([*by_build.values(), *documented])]
         lines.append(
             f"| `{function.name}`: {function.exact} | {function.used_for} | {' | '.join(f'{x:.1f}' for x in cells)} |"
         )

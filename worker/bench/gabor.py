@@ -118,12 +118,12 @@ def pairs(rows: list[Row]) -> Iterator[tuple[Row, Row, Row]]:
     """Plain, Gabor and plain in Gabor's time of each picture and size of model."""
     for name in distinct(rows, "picture"):
         for share in sorted(set(distinct(rows, "pixels_per_gaussian"))):
-            found = [
+            by_method = [
                 of(rows, picture=name, pixels_per_gaussian=share, method=method)
                 for method in ("plain", "gabor", "plain, equal time")
             ]
-            if all(found):
-                yield found[0][0], found[1][0], found[2][0]
+            if all(by_method):
+                yield by_method[0][0], by_method[1][0], by_method[2][0]
 
 
 def table(rows: list[Row]) -> str:

@@ -159,10 +159,10 @@ def table(rows: Sequence[Row]) -> list[str]:
         timed = [row for row in by.get(name, []) if "pass" in row]
         if not timed:
             continue
-        seen = timed[0]
+        size = timed[0]
         said += [
             "",
-            f"{seen['gaussians']} Gaussians, {seen['pixels']} pixels, {seen['pairs']} pairs, tiles of {seen['tile']}",
+            f"{size['gaussians']} Gaussians, {size['pixels']} pixels, {size['pairs']} pairs, tiles of {size['tile']}",
             "",
             "| pass | MB | floor ms | ms |",
             "| --- | --- | --- | --- |",
@@ -213,7 +213,7 @@ def main(argv: list[str]) -> int:
     place = Place("cpu" if wish.dry else "cuda", wish.dry)
     shared = HERE.parents[2] / "shared" / "data"
     captures = wish.captures or [shared / name for name in CAPTURES if (shared / name).is_dir()]
-    wanted = [
+    selection = [
         part
         for part in parts(captures)
         if (part.dry or not wish.dry) and (wish.only is None or part.name in ("card", *wish.only))
@@ -222,7 +222,7 @@ def main(argv: list[str]) -> int:
 
     common = {**origin(), "triton": triton.__version__, "dry": wish.dry}
     ended = []
-    for part in wanted:
+    for part in selection:
         ended.append(run(part, place, wish.out, common))
         if ended[-1] == "unusable":
             return 0

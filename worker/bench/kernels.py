@@ -43,12 +43,12 @@ in composite_forward.cpp and composite_backward.cpp (colour alone, plain scores)
 
 def median_seconds(call: Callable[[], object], rounds: int) -> float:
     call()
-    found = []
+    times = []
     for _ in range(rounds):
         start = time.perf_counter()
         call()
-        found.append(time.perf_counter() - start)
-    return statistics.median(found)
+        times.append(time.perf_counter() - start)
+    return statistics.median(times)
 
 
 def probe(threads: int) -> Row:
@@ -127,9 +127,9 @@ def render_row(scene: Scene, build_name: str, threads: int, rounds: int) -> Row:
         step = Step(*scene.groups, threads=threads)
         v = scene.views[0]
         seconds = median_seconds(lambda: step.forward(v.viewmat, v.K, v.width, v.height, degree=3), rounds)
-        seen = step.visibility
+        visibility = step.visibility
     row = named("render", scene, f"cpu {build_name}", threads, seconds)
-    return row | {"pairs": seen.pairs, "visible": seen.visible}
+    return row | {"pairs": visibility.pairs, "visible": visibility.visible}
 
 
 def memory_row(kind: str) -> Row:
@@ -276,9 +276,9 @@ def size_rows(options: argparse.Namespace) -> Iterator[Row]:
     best, rounds = isa.supported()[0], options.rounds
 
     def row(axis: str, value: int, scene: Scene, threads: int = 2) -> Row:
-        found = step_row(scene, best, threads, rounds)
-        render = sum(found["ms_by_pass"][k] for k in ("project", "bin", "forward"))
-        return found | {"table": "sizes", "axis": axis, "value": value, "render_ms": render}
+        fields = step_row(scene, best, threads, rounds)
+        render = sum(fields["ms_by_pass"][k] for k in ("project", "bin", "forward"))
+        return fields | {"table": "sizes", "axis": axis, "value": value, "render_ms": render}
 
     for n in (1_000, 10_000, 100_000, 300_000, 1_000_000):
         yield row("Gaussians", n, cloud(n, 1920, 1080))
@@ -384,23 +384,23 @@ def best_build(rows: list[Row]) -> str:
 
 def ratios(rows: list[Row]) -> str:
     """AVX2 against AVX-512, and one thread against two, on each scene; then the machine's own peaks."""
-    found = []
+    lines = []
     best = best_build(rows)
     for scene in distinct(of(rows, table="step"), "scene"):
         mine = {(r["backend"], r["threads"]): r["ms"] for r in of(rows, table="step", scene=scene)}
         if ("cpu avx512", 2) in mine and ("cpu avx2", 2) in mine:
             share = mine["cpu avx2", 2] / mine["cpu avx512", 2]
-            found.append(
+            lines.append(
                 f"- {scene}: AVX2 takes {share:.2f} times as long as AVX-512 (target 2.2, then 1.8)."
             )
         if (best, 1) in mine and (best, 2) in mine:
             share = mine[best, 1] / mine[best, 2]
-            found.append(f"- {scene}: two threads are {share:.2f} times as fast as one (target 1.9 at 100k).")
-    found += [
+            lines.append(f"- {scene}: two threads are {share:.2f} times as fast as one (target 1.9 at 100k).")
+    lines += [
         f"- Probed peak on {p['threads']} thread(s): {p['gfma_per_s']:.0f} G multiply-adds a second (matrix product), {p['gb_per_s']:.0f} GB/s (copy)."
         for p in of(rows, table="probe")
     ]
-    return "\n".join(found)
+    return "\n".join(lines)
 
 
 def shares(rows: list[Row]) -> str:

@@ -161,12 +161,12 @@ def _onlooker(address: str, watches: bool) -> Iterator[list[int]]:
     over = threading.Event()
 
     def look() -> None:
-        connection, seen = redis.Redis(unix_socket_path=address), None
+        connection, last = redis.Redis(unix_socket_path=address), None
         while not over.wait(0.25):
             connection.set(keys.watched(JOB), b"1", ex=20)
             tag = connection.hget(keys.snapshot(JOB), "tag")
-            if tag is not None and tag != seen:
-                seen = tag
+            if tag is not None and tag != last:
+                last = tag
                 sizes.append(connection.hstrlen(keys.snapshot(JOB), "ply"))
                 connection.hget(keys.snapshot(JOB), "ply")
         connection.delete(keys.watched(JOB), keys.snapshot(JOB))
@@ -187,14 +187,14 @@ def table(rows: list[Row]) -> str:
     """The medians, by scene and number of steps."""
     lines = []
     for scene, steps in dict.fromkeys((row["scene"], row["asked_steps"]) for row in rows):
-        found = {arm: of(rows, scene=scene, asked_steps=steps, arm=arm) for arm in ARMS}
-        for arm, mine in found.items():
-            if not mine or not found["without"]:
+        by_arm = {arm: of(rows, scene=scene, asked_steps=steps, arm=arm) for arm in ARMS}
+        for arm, mine in by_arm.items():
+            if not mine or not by_arm["without"]:
                 continue
             cells: list[object] = []
             for name in ("seconds", "cpu_seconds"):
                 own, base = (
-                    statistics.median(row[name] for row in some) for some in (mine, found["without"])
+                    statistics.median(row[name] for row in some) for some in (mine, by_arm["without"])
                 )
                 cells.append(f"{own:.2f} ({100 * (own / base - 1):+.1f} %)")
             cells.append(f"{statistics.median(row['snapshots'] for row in mine):g}")

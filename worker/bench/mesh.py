@@ -31,7 +31,7 @@ from _train import bare
 
 from splatmill.schema import Event, ModelCameras, TrainOptions
 from splatmill_worker import pipeline
-from splatmill_worker.mesh.build import Wanted, build
+from splatmill_worker.mesh.build import MeshSettings, build
 from splatmill_worker.mesh.colors import colored
 from splatmill_worker.mesh.depths import View
 from splatmill_worker.mesh.samples import Region
@@ -70,7 +70,9 @@ def measured(options: argparse.Namespace) -> Iterator[Row | str]:
     }
     views: list[View] = []
     began = time.process_time()
-    built = build(contents.gaussians, cameras, Wanted(FACES[0], box=BOX), antialias=antialias, views=views)
+    built = build(
+        contents.gaussians, cameras, MeshSettings(FACES[0], box=BOX), antialias=antialias, views=views
+    )
     yield same | row(f"Splatmill, {FACES[0]:,} triangles at most", built.mesh, began, true, life)
     near = [_in_box(view) for view in views]
     methods: dict[str, Callable[[], Mesh]] = {

@@ -78,9 +78,9 @@ class Timed(NamedTuple):
 
 def timed(step: Step, viewmat: Tensor, stats: PhotoStats, number: int) -> Timed:
     began, cpu = time.perf_counter(), time.process_time()
-    seen = step.train(viewmat, K, None, degree=3, rates=RATES, step=number, photo_stats=stats)
+    result = step.train(viewmat, K, None, degree=3, rates=RATES, step=number, photo_stats=stats)
     ms, cpu_ms = 1e3 * (time.perf_counter() - began), 1e3 * (time.process_time() - cpu)
-    return Timed(ms, cpu_ms, seen.visible, step.share_computed)
+    return Timed(ms, cpu_ms, result.visible, step.share_computed)
 
 
 def measure(options: argparse.Namespace) -> Iterator[Row]:

@@ -236,12 +236,12 @@ def as_model(scene: Scene) -> pycolmap.Reconstruction:
         image = pycolmap.Image(name=view.name, camera_id=number, image_id=number)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(camera.viewmat[:3]))
     assert scene.point_views is not None
-    offsets, seen = scene.point_views
+    offsets, views = scene.point_views
     places: dict[int, list[Float]] = {number: [] for number in range(1, len(scene.views) + 1)}
     elements: list[list[tuple[int, int]]] = []
     for index in range(scene.facts.get("sparse_points", len(scene.points))):
         row = []
-        for view_index in seen[offsets[index] : offsets[index + 1]]:
+        for view_index in views[offsets[index] : offsets[index + 1]]:
             image_id = int(view_index) + 1
             row.append((image_id, len(places[image_id])))
             places[image_id].append(np.zeros(2))
@@ -293,8 +293,8 @@ def measure(
 
 def reference(name: str) -> dict[str, Camera]:
     """The reference cameras of a scene; none where there are none to trust."""
-    found = None if name in MISPLACED else posed.find(_data.SHARED / FOLDERS[name])
-    return {view.name: view.camera for view in found.load().views} if found is not None else {}
+    poses = None if name in MISPLACED else posed.find(_data.SHARED / FOLDERS[name])
+    return {view.name: view.camera for view in poses.load().views} if poses is not None else {}
 
 
 def scenes_bench(options: argparse.Namespace) -> Iterator[Row | str]:

@@ -134,11 +134,11 @@ def formulas(_: argparse.Namespace) -> Iterable[Row]:
 
 def per_gaussian(rows: Iterable[Row], figure: str = "gaussian") -> dict[float, float]:
     """By value of the axis, the worst Gaussian's error over all groups of gradients, in units."""
-    found: dict[float, float] = {}
+    errors: dict[float, float] = {}
     for row in rows:
         if figure in row:
-            found[row["value"]] = max(found.get(row["value"], 0.0), row[figure])
-    return found
+            errors[row["value"]] = max(errors.get(row["value"], 0.0), row[figure])
+    return errors
 
 
 def engine_names(rows: list[Row]) -> list[str]:
@@ -188,9 +188,9 @@ def draw_formulas(rows: list[Row]) -> Figure:
     for formula, panel in zip(FORMULAS, panels, strict=True):
         mine = of(rows, axis=f"formula: {formula.name}")
         for name in distinct(mine, "engine"):
-            found = of(mine, engine=name)
-            points = [(r["value"], max(r["error"], 1e-9)) for r in found]
-            tint = _plot.WINNER if found[0]["used"] else _plot.LOSER
+            series = of(mine, engine=name)
+            points = [(r["value"], max(r["error"], 1e-9)) for r in series]
+            tint = _plot.WINNER if series[0]["used"] else _plot.LOSER
             panel.plot(*zip(*points, strict=True), color=tint, label=name)
         _plot.name(panel, formula.label, log="yx" if formula.log else "y")
         panel.legend(fontsize=8)
@@ -282,9 +282,9 @@ def decisions(rows: list[Row]) -> str:
 def definition(rows: list[Row]) -> str:
     lines = []
     for ratio in ORACLE_RATIOS:
-        found = {r["quantity"]: r["max"] for r in of(rows, axis="oracle", value=ratio)}
-        if found:
-            lines.append([f"{ratio:g}", *(f"{found[k]:.0e}" for k in ("image", *GROUPS))])
+        errors = {r["quantity"]: r["max"] for r in of(rows, axis="oracle", value=ratio)}
+        if errors:
+            lines.append([f"{ratio:g}", *(f"{errors[k]:.0e}" for k in ("image", *GROUPS))])
     return table("|".join(("axis ratio", "image", *GROUPS)), lines)
 
 

@@ -133,10 +133,10 @@ def by_boost(rows: list[Row], *path: str) -> dict[float, list[float]]:
 def losses(rows: list[Row]) -> dict[tuple[int, int], dict[float, list[float]]]:
     """By longest side and steps, and by boost: for each scene, the best boost's median PSNR over seeds less this one's."""
     trained = [row for row in of(rows, part="runs", group=None) if row.get("psnr") is not None]
-    found: dict[tuple[int, int], dict[float, list[float]]] = {}
+    by_size: dict[tuple[int, int], dict[float, list[float]]] = {}
     for longest, steps in dict.fromkeys((row["longest"], row["steps"]) for row in trained):
         mine = of(trained, longest=longest, steps=steps)
-        below = found[longest, steps] = {}
+        below = by_size[longest, steps] = {}
         for scene in distinct(mine, "scene"):
             of_scene = of(mine, scene=scene)
             medians = {
@@ -145,7 +145,7 @@ def losses(rows: list[Row]) -> dict[tuple[int, int], dict[float, list[float]]]:
             }
             for boost, psnr in medians.items():
                 below.setdefault(boost, []).append(max(medians.values()) - psnr)
-    return found
+    return by_size
 
 
 def spread(values: dict[float, list[float]], digits: str) -> str:
@@ -161,9 +161,9 @@ def summary(rows: list[Row]) -> str:
     half = [row for row in of(rows, part="curvature") if 0.4 < row["share"] < 0.6]
     sentences = []
     if half:
-        found = spread(by_boost(half, "ratio"), ".2g")
+        eigenvalues = spread(by_boost(half, "ratio"), ".2g")
         sentences.append(
-            f"Half way through a training, the largest eigenvalue over its limit is {found}; median and range over the scenes ({len(distinct(half, 'scene'))}), by boost."
+            f"Half way through a training, the largest eigenvalue over its limit is {eigenvalues}; median and range over the scenes ({len(distinct(half, 'scene'))}), by boost."
         )
     sentences += [
         f"After {steps} steps at {longest} pixels, the held-out PSNR is below the scene's best by, in dB: {spread(below, '.2f')}."
@@ -274,12 +274,12 @@ def warnings_list(rows: list[Row]) -> str:
 
 
 def needles_table(rows: list[Row]) -> str:
-    found = of(rows, part="needles")
+    mine = of(rows, part="needles")
     lines = [
-        [f"{ratio:g}", *(f"{r['largest']:.3g}, {r['condition']:.1e}" for r in of(found, ratio_of=ratio))]
-        for ratio in distinct(found, "ratio_of")
+        [f"{ratio:g}", *(f"{r['largest']:.3g}, {r['condition']:.1e}" for r in of(mine, ratio_of=ratio))]
+        for ratio in distinct(mine, "ratio_of")
     ]
-    head = ["axis ratio", *(f"{name}: largest, condition" for name in distinct(found, "metric"))]
+    head = ["axis ratio", *(f"{name}: largest, condition" for name in distinct(mine, "metric"))]
     return table("|".join(head), lines)
 
 
@@ -313,8 +313,8 @@ def draw_ratio(panel: Axes, rows: list[Row]) -> None:
             ("ratio", "-", "o", "mean of the photos / 38"),
             ("stochastic", ":", ".", "in the mean square"),
         ):
-            found = by_boost(of(rows, scene=scene), field)
-            _plot.middles(panel, found, style, marker=marker, color=color, label=f"{scene}: {label}")
+            ratios = by_boost(of(rows, scene=scene), field)
+            _plot.middles(panel, ratios, style, marker=marker, color=color, label=f"{scene}: {label}")
     title = "Adam's preconditioned Hessian, half way through a training"
     _plot.name(panel, y="largest eigenvalue / stability limit", title=title)
 
@@ -329,8 +329,8 @@ def draw_groups(panel: Axes, rows: list[Row]) -> None:
     _plot.name(panel, y="growth in the mean square, over the limit", title=title)
 
 
-def draw_quality(panel: Axes, found: dict[tuple[int, int], dict[float, list[float]]]) -> None:
-    for color, ((longest, steps), below) in zip(_plot.CYCLE, found.items(), strict=False):
+def draw_quality(panel: Axes, drops: dict[tuple[int, int], dict[float, list[float]]]) -> None:
+    for color, ((longest, steps), below) in zip(_plot.CYCLE, drops.items(), strict=False):
         psnr = {b: [-x for x in below[b]] for b in sorted(below)}
         _plot.middles(panel, psnr, marker="o", color=color, label=f"{steps} steps, {longest} px")
         panel.fill_between(

@@ -154,12 +154,12 @@ Pair = tuple[Row, Row]
 
 def compared_scenes(rows: list[Row]) -> list[list[Pair]]:
     """The pairs of each scene and number of tiles, by seed."""
-    found: dict[tuple[Any, ...], list[Pair]] = {}
+    by_scene: dict[tuple[Any, ...], list[Pair]] = {}
     for row in rows:
         if row["tiles"] > 1:
             for one in of(rows, scene=row["scene"], steps=row["steps"], seed=row["seed"], tiles=1):
-                found.setdefault((row["scene"], row["tiles"], row["steps"]), []).append((one, row))
-    return [sorted(pairs, key=lambda pair: pair[0]["seed"]) for pairs in found.values()]
+                by_scene.setdefault((row["scene"], row["tiles"], row["steps"]), []).append((one, row))
+    return [sorted(pairs, key=lambda pair: pair[0]["seed"]) for pairs in by_scene.values()]
 
 
 def difference(pair: Pair) -> float:

@@ -49,13 +49,13 @@ class Files:
     references: Path
 
     @staticmethod
-    def of(given: Path | None, name: str) -> Files:
+    def of(path: Path | None, name: str) -> Files:
         """The repository's own files of a name, or three files beside a given file of rows."""
         results, figures = HERE / "results", HERE / "figures"
         references = results / f"{name}_references.jsonl"
-        if given is None:
+        if path is None:
             return Files(results / f"{name}.jsonl", HERE / f"{name}.md", figures / f"{name}.png", references)
-        return Files(given, given.with_suffix(".md"), given.with_suffix(".png"), references)
+        return Files(path, path.with_suffix(".md"), path.with_suffix(".png"), references)
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Peer:
 
 
 @dataclass(frozen=True)
-class Wanted:
+class Request:
     """The runs and models that a call asks for; `absent` has a sentence for each scene without data."""
 
     runs: list[BenchRun]
@@ -86,33 +86,33 @@ def main(argv: list[str]) -> int:
 
         return do_job(asked.job)
     try:
-        wanted = _wanted(asked)
+        request = _request(asked)
     except ValueError as error:
         parser.error(str(error))
     files = Files.of(asked.results, "train_official" if asked.official else "train")
     whole = True
     if not asked.plot_only:
-        for sentence in wanted.absent:
+        for sentence in request.absent:
             print(sentence, file=sys.stderr)
         try:
-            whole = _measure(wanted, files.rows, asked.work) and not wanted.absent
+            whole = _measure(request, files.rows, asked.work) and not request.absent
         except KeyboardInterrupt:
             print(
                 f"\nStopped. Finished rows are in {files.rows}; the same command continues.", file=sys.stderr
             )
             return 130
-    found, references = lines(files.rows), lines(files.references)
-    if not found:
+    rows, references = lines(files.rows), lines(files.references)
+    if not rows:
         print(f"There are no rows in {files.rows}, so nothing is drawn.", file=sys.stderr)
         return 1
     draw, document = (official.draw, official.document) if asked.official else (figure.draw, tables.document)
-    draw(found, references, files.figure)
-    files.tables.write_text(document(found, references, files.rows, files.tables, files.figure))
+    draw(rows, references, files.figure)
+    files.tables.write_text(document(rows, references, files.rows, files.tables, files.figure))
     print(f"Tables: {files.tables}\nFigure: {files.figure}")
     return 0 if whole else 1
 
 
-def _wanted(asked: argparse.Namespace) -> Wanted:
+def _request(asked: argparse.Namespace) -> Request:
     """What the arguments ask for. Raises ValueError, as a sentence, for unknown names."""
     known, absent = [], []
     if asked.official and (asked.scenes or asked.configs or asked.peer):
@@ -135,25 +135,25 @@ def _wanted(asked: argparse.Namespace) -> Wanted:
     if asked.peer:
         if len(_split(asked.scenes)) != 1:
             raise ValueError("--peer is judged on one scene: name it with --scenes, and no other.")
-        return Wanted([], [_peer(text, scene) for text in asked.peer for scene in known], absent)
-    return Wanted(runs_of(known, dict.fromkeys(names), limits, dict.fromkeys(seeds)), [], absent)
+        return Request([], [_peer(text, scene) for text in asked.peer for scene in known], absent)
+    return Request(runs_of(known, dict.fromkeys(names), limits, dict.fromkeys(seeds)), [], absent)
 
 
-def _measure(wanted: Wanted, path: Path, work: Path) -> bool:
+def _measure(request: Request, path: Path, work: Path) -> bool:
     """Measure and append the rows that the file at `path` lacks; False where one could not be measured."""
-    found = lines(path)
-    todo = [run for run in missing(wanted.runs, found) if not idle(run, found)]
-    if wanted.runs:
-        print(f"{len(wanted.runs)} rows are asked for; {len(todo)} are not there yet.")
+    rows = lines(path)
+    todo = [run for run in missing(request.runs, rows) if not idle(run, rows)]
+    if request.runs:
+        print(f"{len(request.runs)} rows are asked for; {len(todo)} are not there yet.")
     involved = {run.scene.name: run.scene for run in todo}
     unusable = {name for name, scene in involved.items() if not _usable(scene, work)}
     todo = [run for run in todo if run.scene.name not in unusable]
     whole = not unusable
     if todo:
-        left = format_duration(estimate.seconds_left(todo, found))
+        left = format_duration(estimate.seconds_left(todo, rows))
         print(f"About {left}. Ctrl-C loses the row in work at most; the same command continues.", flush=True)
     for number, run in enumerate(todo):
-        if idle(run, found):
+        if idle(run, rows):
             print(f"[{number + 1}/{len(todo)}] {run}: the default's plan already, nothing to measure")
             continue
         try:
@@ -163,12 +163,12 @@ def _measure(wanted: Wanted, path: Path, work: Path) -> bool:
             whole = False
             continue
         append(path, row)
-        found.append(row)
+        rows.append(row)
         if row["code"] != code_version():
             print("The code was changed meanwhile: this row compares with later ones only.", file=sys.stderr)
-        left = format_duration(estimate.seconds_left(todo[number + 1 :], found))
+        left = format_duration(estimate.seconds_left(todo[number + 1 :], rows))
         print(f"[{number + 1}/{len(todo)}] {run}: {_said(row)}; about {left} left", flush=True)
-    for peer in wanted.peers:
+    for peer in request.peers:
         whole &= _judge(peer, path, work)
     return whole
 
@@ -212,9 +212,9 @@ def _said(row: Row) -> str:
     return f"{score} after {row['seconds']['train']:.1f} s of training ({row['wall_seconds']:.0f} s in all)"
 
 
-def _split(given: list[str] | None) -> list[str]:
+def _split(texts: list[str] | None) -> list[str]:
     """The names in a list of arguments, separated by blanks or commas."""
-    return [name for text in given or [] for name in text.split(",") if name]
+    return [name for text in texts or [] for name in text.split(",") if name]
 
 
 def _seed(text: str) -> int:

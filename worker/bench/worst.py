@@ -69,12 +69,12 @@ def searched(name: str, options: argparse.Namespace) -> Iterator[Row]:
     chance = at_random(search, SHARE * options.seconds, seed)
     each = (1 - SHARE) * options.seconds / len(TARGETS) / 2
     for aim in TARGETS:
-        found = {
+        by_searcher = {
             RANDOM: chance[aim],
             HYPOTHESIS: by_hypothesis(search, aim, each, seed),
             OPTIMISER: by_optimiser(search, aim, each, seed),
         }
-        for searcher, progress in found.items():
+        for searcher, progress in by_searcher.items():
             yield {
                 "bench": "worst", "kind": "progress", "engine": name, "target": aim, "searcher": searcher,
                 "seed": seed, "evaluations": progress.evaluations, "points": progress.points,

@@ -56,9 +56,9 @@ def faults() -> Iterator[str]:
 
 
 if __name__ == "__main__":
-    found = list(faults())
+    lines = list(faults())
     print(
-        "\n".join(found)
+        "\n".join(lines)
         or f"{len(MUTANTS) + len(NEXT)} mutations fit the kernels, their rows and their table."
     )
-    sys.exit(bool(found))
+    sys.exit(bool(lines))

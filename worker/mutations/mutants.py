@@ -314,8 +314,8 @@ MUTANTS = [
     reference("new squares weigh as with 0.999", "adam.py", "(1 - beta2) * g * g", "(1 - BETA2) * g * g"),
     reference("the drift lacks its correction", "adam.py", "math.sqrt((1 - beta2**s) / beta2**j)", "math.sqrt(1 / beta2**j)"),
     reference("SSIM's second constant", "loss.py", "C1, C2 = 0.01**2, 0.03**2", "C1, C2 = 0.01**2, 0.02**2"),
-    reference("L1 over all pixels under a mask", "loss.py", "l1 = (color - seen).abs().sum() / (3 * count)",
-              "l1 = (color - seen).abs().mean()"),
+    reference("L1 over all pixels under a mask", "loss.py", "l1 = (color - target).abs().sum() / (3 * count)",
+              "l1 = (color - target).abs().mean()"),
     reference("the border shows nothing", "correlate.py", "clamp(0, width - 1)", "clamp(1, width - 1)"),
     reference("two nearest neighbours", "knn.py", "k = min(NEIGHBORS, n - 1)", "k = min(NEIGHBORS - 1, n - 1)"),
     # ---- Triton's kernels

@@ -276,11 +276,11 @@ def read() -> dict[tuple[str, str], Row]:
     return {(row["file"], row["mutant"]): row for row in rows}
 
 
-def write(found: dict[tuple[str, str], Row]) -> None:
+def write(results: dict[tuple[str, str], Row]) -> None:
     """Rows and table, in the order of the list, with those that another process has written meanwhile."""
     with (HERE / "mutants.py").open() as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        rows = read() | found
+        rows = read() | results
         known = [rows[m.file, m.name] for m in (*MUTANTS, *NEXT) if (m.file, m.name) in rows]
         ROWS.write_text("".join(json.dumps(row) + "\n" for row in known))
     caught = sum(bool(row["caught_by"]) for row in known)
@@ -320,7 +320,7 @@ def main() -> int:
     parser.add_argument("--next", action="store_true", help="those of NEXT, which are known to survive")
     parser.add_argument("--table-only", action="store_true")
     options = parser.parse_args()
-    found: dict[tuple[str, str], Row] = {}
+    results: dict[tuple[str, str], Row] = {}
     if not options.table_only:
         copy = Copy(ROOT / "worker" / "build" / "mutations" / (options.backend or "all"))
         copy_tree(copy)
@@ -328,20 +328,20 @@ def main() -> int:
         for mutant in chosen(options.only, options.next, options.backend):
             if options.fresh and before.get((mutant.file, mutant.name), {}).get("caught_by"):
                 continue
-            found[mutant.file, mutant.name] = row = tried(copy, mutant)
+            results[mutant.file, mutant.name] = row = tried(copy, mutant)
             print(
                 f"{row['seconds']:4} s  {mutant.file}: {mutant.name}: {row['caught_by'] or 'SURVIVES'}",
                 flush=True,
             )
-            write(found)
+            write(results)
         works, said = build(copy) if (copy.work / "cmake").exists() else (True, "")
         if not works:
             raise SystemExit(f"The kernels do not build:\n{said}")
-        catchers = sorted({f"{TESTS}/{row['caught_by']}" for row in found.values() if row["caught_by"]})
+        catchers = sorted({f"{TESTS}/{row['caught_by']}" for row in results.values() if row["caught_by"]})
         if failing := pytest(copy, None, catchers) if catchers else "":
             raise SystemExit(f"This caught a mutant, and fails without any mutation too: {failing}")
         print("Every test that caught a mutant passes without mutations.")
-    write(found)
+    write(results)
     rows = read()
     return 0 if all(rows[m.file, m.name]["caught_by"] for m in MUTANTS if (m.file, m.name) in rows) else 1
 

@@ -177,11 +177,11 @@ def _bench(name: str, arguments: list[str]) -> int:
     places = (path for folder in folders for path in (folder / f"{name}.py", folder / name / f"{name}.py"))
     script = next((path for path in places if path.is_file()), None)
     if script is None:
-        found = [path.stem for folder in folders for path in folder.glob("*.py")]
-        found += [
+        stems = [path.stem for folder in folders for path in folder.glob("*.py")]
+        stems += [
             path.stem for folder in folders for path in folder.glob("*/*.py") if path.stem == path.parent.name
         ]
-        known = sorted(stem for stem in found if not stem.startswith("_"))
+        known = sorted(stem for stem in stems if not stem.startswith("_"))
         print(
             f"There is no benchmark {name!r}. The benchmarks are {', '.join(known)}."
             if known

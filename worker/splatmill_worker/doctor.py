@@ -34,13 +34,13 @@ class Finding:
 
     topic: what was checked.
     verdict: how it turned out.
-    seen: what was found.
+    result: what the check showed.
     advice: what to do; empty where there is nothing to do.
     """
 
     topic: str
     verdict: Verdict
-    seen: str
+    result: str
     advice: str = ""
 
 
@@ -51,8 +51,8 @@ def run_checks() -> list[Finding]:
         try:
             findings.extend(check())
         except Exception as error:  # the other checks still have to run
-            seen = f"The check failed: {type(error).__name__}: {error}"
-            findings.append(Finding(check.__name__.strip("_"), "bad", seen))
+            failure = f"The check failed: {type(error).__name__}: {error}"
+            findings.append(Finding(check.__name__.strip("_"), "bad", failure))
     return findings
 
 
@@ -65,7 +65,7 @@ def report(*, as_json: bool = False) -> int:
         width = max(len(finding.topic) for finding in findings)
         marks = {"ok": "ok  ", "warning": "note", "bad": "BAD "}
         for finding in findings:
-            print(f"{marks[finding.verdict]}  {finding.topic:{width}}  {finding.seen}")
+            print(f"{marks[finding.verdict]}  {finding.topic:{width}}  {finding.result}")
             if finding.advice:
                 print(f"{'':{width + 8}}-> {finding.advice}")
     return int(any(finding.verdict == "bad" for finding in findings))
@@ -73,9 +73,9 @@ def report(*, as_json: bool = False) -> int:
 
 def _python() -> Iterator[Finding]:
     old = sys.version_info < (3, 11)
-    seen = f"{platform.python_version()} at {sys.executable}, {platform.platform()}"
+    interpreter = f"{platform.python_version()} at {sys.executable}, {platform.platform()}"
     yield Finding(
-        "python", "bad" if old else "ok", seen, "Splatmill needs Python 3.11 or newer." if old else ""
+        "python", "bad" if old else "ok", interpreter, "Splatmill needs Python 3.11 or newer." if old else ""
     )
 
 
@@ -99,10 +99,10 @@ def _parts() -> Iterator[Finding]:
     yield Finding("parts", "ok", ", ".join(versions))
     if missing:
         lacking: Verdict = "bad" if set(missing) - {"splatmill-server"} else "warning"
-        wanted = " ".join(
+        packages = " ".join(
             name.replace("splatmill-server", "'splatmill-server[embedded]'") for name in missing
         )
-        advice = f"Install with `pip install {wanted}`, in a source tree with `make install`."
+        advice = f"Install with `pip install {packages}`, in a source tree with `make install`."
         yield Finding("parts", lacking, f"not installed: {', '.join(missing)}", advice)
     pycolmap = importlib.import_module("pycolmap")
     yield Finding("colmap", "ok", f"{pycolmap.COLMAP_version}, CUDA {'yes' if pycolmap.has_cuda else 'no'}")
@@ -133,12 +133,12 @@ def _kernels() -> Iterator[Finding]:
 def _threads() -> Iterator[Finding]:
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     limit = os.environ.get("OMP_NUM_THREADS")
-    seen = f"{usable} of {os.cpu_count()} cores" + (f", OMP_NUM_THREADS={limit}" if limit else "")
+    cores = f"{usable} of {os.cpu_count()} cores" + (f", OMP_NUM_THREADS={limit}" if limit else "")
     wasted = limit is not None and limit.isdigit() and int(limit) < usable
     yield Finding(
         "threads",
         "warning" if wasted else "ok",
-        seen,
+        cores,
         "Unset OMP_NUM_THREADS to use all cores." if wasted else "",
     )
 
@@ -150,11 +150,11 @@ def _memory() -> Iterator[Finding]:
     total, free = now.total, now.available
     limit = memory.group_limit()
     usable = min(free, limit) if limit else free
-    seen = f"{format_bytes(free)} free of {format_bytes(total)}"
-    seen += f", limited to {format_bytes(limit)} by the container" if limit and limit < total else ""
+    amounts = f"{format_bytes(free)} free of {format_bytes(total)}"
+    amounts += f", limited to {format_bytes(limit)} by the container" if limit and limit < total else ""
     low = usable < LOW_MEMORY
     advice = "Close other programs, or set a smaller image_size and max_memory." if low else ""
-    yield Finding("memory", "warning" if low else "ok", seen, advice)
+    yield Finding("memory", "warning" if low else "ok", amounts, advice)
 
 
 def _disk() -> Iterator[Finding]:
@@ -176,12 +176,12 @@ def _decoders() -> Iterator[Finding]:
     with confined([]) as decoders:
         lacking = decoders.lacking()
     if lacking:
-        seen = f"Photos are decoded in processes without secrets, but {lacking}"
+        weakness = f"Photos are decoded in processes without secrets, but {lacking}"
         advice = (
             "Landlock and seccomp of Linux do that. Where photos come from strangers, run workers in "
             "containers, or as a user with no other rights."
         )
-        yield Finding("decoders", "warning", seen, advice)
+        yield Finding("decoders", "warning", weakness, advice)
     else:
         yield Finding(
             "decoders",

@@ -172,7 +172,7 @@ class TrainingFailed(WorkerError):
     """Training ended with a numerical failure.
 
     name: which failure.
-    seen: what was observed, as the end of a sentence.
+    symptom: what was observed, as the end of a sentence.
     step: number of the training step, from 1.
     """
 
@@ -193,15 +193,15 @@ class TrainingFailed(WorkerError):
         FailureName.memory: "Set a smaller image_size or max_gaussians.",
     }
 
-    def __init__(self, name: FailureName, seen: str, *, step: int) -> None:
+    def __init__(self, name: FailureName, symptom: str, *, step: int) -> None:
         super().__init__(
             self.CODES[name],
-            f"Training stopped at step {step}: {seen}",
+            f"Training stopped at step {step}: {symptom}",
             facts={"step": step},
             advice=self.ADVICE[name],
         )
         self.name = name
-        self.seen = seen
+        self.symptom = symptom
         self.step = step
 
 
@@ -265,10 +265,10 @@ class DiskReserveReached(WorkerError):
     """
 
     def __init__(self, folder: Path, free: int, reserve: int, needed: int) -> None:
-        wanted = f", and {format_bytes(needed)} more are needed" if needed else ""
+        need = f", and {format_bytes(needed)} more are needed" if needed else ""
         super().__init__(
             "worker_disk_full",
-            f"The disk of the worker's data folder {folder} has {format_bytes(free)} left{wanted}; "
+            f"The disk of the worker's data folder {folder} has {format_bytes(free)} left{need}; "
             f"{format_bytes(reserve)} stay free.",
             facts={"free": free, "reserve": reserve, "needed": needed},
             advice="Free space on that disk, then restart the job: it continues from its last checkpoint.",

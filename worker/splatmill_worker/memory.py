@@ -34,11 +34,11 @@ def attempt_limit() -> int | None:
 
 def available() -> int:
     """Return how many more bytes this process can use: free on the machine, in its control groups, and of its limit."""
-    found = [int(psutil.virtual_memory().available)]
-    found += [max(0, limit - taken) for limit, taken in _groups()]
+    amounts = [int(psutil.virtual_memory().available)]
+    amounts += [max(0, limit - taken) for limit, taken in _groups()]
     if (limit := attempt_limit()) is not None:
-        found.append(max(0, limit - used()))
-    return min(found)
+        amounts.append(max(0, limit - used()))
+    return min(amounts)
 
 
 def used() -> int:
@@ -145,17 +145,17 @@ class TreeMemory:
             except psutil.Error:
                 return []
         parents = dict(_processes())
-        found = {self._root}
+        members = {self._root}
         grown = True
         while grown:
             more = {
                 pid
                 for pid, (parent, group) in parents.items()
-                if pid not in found and (parent in found or group == self._root)
+                if pid not in members and (parent in members or group == self._root)
             }
             grown = bool(more)
-            found |= more
-        return sorted(found)
+            members |= more
+        return sorted(members)
 
 
 def _processes() -> Iterator[tuple[int, tuple[int, int]]]:
@@ -179,11 +179,11 @@ def _memory_of(pid: int) -> tuple[int, int]:
             return 0, 0
     try:
         with open(f"/proc/{pid}/status") as file:
-            found = dict(line.split(":", 1) for line in file)
+            fields = dict(line.split(":", 1) for line in file)
     except OSError:
         return 0, 0
 
     def bytes_of(name: str) -> int:
-        return 1024 * int(found[name].split()[0]) if name in found else 0
+        return 1024 * int(fields[name].split()[0]) if name in fields else 0
 
     return bytes_of("RssAnon") + bytes_of("VmSwap"), bytes_of("RssShmem")

@@ -307,8 +307,8 @@ def without(scene: Scene, indices: Collection[int], reason: str) -> Scene:
     scene = replace(scene, views=views, left_out=(*scene.left_out, *left_out))
     if scene.point_views is None:
         return scene
-    offsets, seen = scene.point_views
-    of_point = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))[kept[seen]]
+    offsets, observers = scene.point_views
+    of_point = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))[kept[observers]]
     used, lengths = np.unique(of_point, return_counts=True)
     return replace(
         scene,
@@ -318,7 +318,7 @@ def without(scene: Scene, indices: Collection[int], reason: str) -> Scene:
         track_lengths=lengths.astype(np.int32),
         point_views=PointViews(
             np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
-            (np.cumsum(kept) - 1)[seen[kept[seen]]].astype(np.int32),
+            (np.cumsum(kept) - 1)[observers[kept[observers]]].astype(np.int32),
         ),
     )
 

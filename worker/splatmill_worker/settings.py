@@ -47,14 +47,14 @@ def keep_work() -> float | None:
 
     Raises ValueError.
     """
-    found: float | None = _read("SPLATMILL_KEEP_WORK", parse_duration, None)
-    return found
+    seconds: float | None = _read("SPLATMILL_KEEP_WORK", parse_duration, None)
+    return seconds
 
 
 def log_format() -> LogFormat:
     """Return SPLATMILL_LOG_FORMAT, or `text`. Raises ValueError for another word than text and json."""
-    found: LogFormat = _read("SPLATMILL_LOG_FORMAT", parse_format, "text")
-    return found
+    choice: LogFormat = _read("SPLATMILL_LOG_FORMAT", parse_format, "text")
+    return choice
 
 
 def umask() -> int:
@@ -79,8 +79,8 @@ def max_run_time() -> float | None:
 
 def max_memory() -> int | None:
     """Return SPLATMILL_MAX_MEMORY in bytes (0: no limit), or None if it is not set. Raises ValueError."""
-    found: int | None = _read("SPLATMILL_MAX_MEMORY", parse_bytes, None)
-    return found
+    limit: int | None = _read("SPLATMILL_MAX_MEMORY", parse_bytes, None)
+    return limit
 
 
 def max_unpacked() -> int:

@@ -64,7 +64,7 @@ class LocalFile:
 
 
 @dataclass(frozen=True)
-class Found:
+class CaptureFiles:
     """The files of a capture.
 
     ignored: relative names of the files that are not used.
@@ -84,7 +84,7 @@ class Found:
     remarks: tuple[str, ...] = ()
 
     @staticmethod
-    def of(files: Iterable[LocalFile], ignored: Iterable[str] = ()) -> "Found":
+    def of(files: Iterable[LocalFile], ignored: Iterable[str] = ()) -> "CaptureFiles":
         """Return the files under names that the service accepts: one bad name keeps no other file from being used."""
         stored: list[LocalFile] = []
         renamed: list[tuple[str, str]] = []
@@ -98,7 +98,7 @@ class Found:
             if name != unicodedata.normalize("NFC", file.name):
                 renamed.append((file.name, name))
             stored.append(replace(file, name=name))
-        return Found(tuple(stored), tuple(ignored), renamed=tuple(renamed), left_out=tuple(left_out))
+        return CaptureFiles(tuple(stored), tuple(ignored), renamed=tuple(renamed), left_out=tuple(left_out))
 
     def count(self, role: Role) -> int:
         """Return the number of files with this role."""
@@ -139,7 +139,7 @@ class Found:
         return sum(file.size for file in self.files)
 
 
-def find_files(path: str | os.PathLike[str]) -> Found:
+def find_files(path: str | os.PathLike[str]) -> CaptureFiles:
     """Find the files of the capture at `path`: a photo, a video, a zip archive, a folder of photos, a posed data set or
     a part of one (`_around`).
 
@@ -243,7 +243,7 @@ def find_files(path: str | os.PathLike[str]) -> Found:
                     ]
                 ),
             )
-    capture_files = Found.of(files, ignored)
+    capture_files = CaptureFiles.of(files, ignored)
     if not capture_files.count(Role.images):
         raise NothingToUpload(capture_files.left_out[0][1], "Rename the files.")
     remarks = around + _left_out(unreadable) + unread(ignored) + ([] if posed else unread_cameras(names))
@@ -370,13 +370,13 @@ def start_model(path: Path) -> LocalFile:
         raise NothingToUpload(str(error)) from error
 
 
-def _single(path: Path) -> Found:
+def _single(path: Path) -> CaptureFiles:
     if _suffix(path.name) not in PHOTO_SUFFIXES + VIDEO_SUFFIXES + ARCHIVE_SUFFIXES:
         raise NothingToUpload(
             f"{path.name} is neither a photo, nor a video, nor a zip archive.",
             " ".join(unread([path.name]) or ["Give a folder of photos, a zip archive or a video."]),
         )
-    return Found.of([_local(Role.images, path.name, path)])
+    return CaptureFiles.of([_local(Role.images, path.name, path)])
 
 
 def _has_photos_beside(named: Iterable[str], photo_root: str) -> bool:

@@ -96,8 +96,8 @@ class Trainer:
                 offset += len(piece)
                 continue
             conflicts += 1
-            found = self.http.head(upload)
-            offset = int(found.headers.get("Upload-Offset", 0)) if found.is_success else 0
+            status = self.http.head(upload)
+            offset = int(status.headers.get("Upload-Offset", 0)) if status.is_success else 0
         arrived = offset == len(content)
         if not arrived:
             self.http.put(address, content=content).raise_for_status()

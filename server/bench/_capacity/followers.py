@@ -49,9 +49,9 @@ def follow_all(served: Served, redis_url: str, count: int) -> dict[str, Any]:
 
         before, busy = process.memory_info().rss, sum(process.cpu_times()[:2])
         began = time.perf_counter()
-        found, (held, memory) = asyncio.run(_follow_all(str(served.socket), job_id, count, act))
+        streams, (held, memory) = asyncio.run(_follow_all(str(served.socket), job_id, count, act))
         seconds = time.perf_counter() - began
-    whole = sum(told == found[0] and told[-1:] == ["failed"] for told in found)
+    whole = sum(told == streams[0] and told[-1:] == ["failed"] for told in streams)
     return {
         "followers": count,
         "told_everything": whole,

@@ -34,22 +34,22 @@ class Operations:
 @contextmanager
 def counted() -> Iterator[Operations]:
     """Count what all threads of this process ask of Redis, by synchronous connections, and of any storage."""
-    found, lock = Operations(), threading.Lock()
+    operations, lock = Operations(), threading.Lock()
     send = redis.connection.AbstractConnection.send_packed_command
     methods = {name: getattr(Storage, name) for name in _STORAGE}
 
     def counting(self: Any, command: Any, check_health: bool = True) -> Any:
         with lock:
-            found.round_trips += 1
+            operations.round_trips += 1
         return send(self, command, check_health)  # type: ignore[no-untyped-call]  # redis leaves it untyped
 
     def wrapped(name: str, method: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(method)
         def call(self: Storage, *arguments: Any, **named: Any) -> Any:
             with lock:
-                found.storage[name] += 1
+                operations.storage[name] += 1
                 if name in ("put", "put_new"):
-                    found.written += _size(arguments[1])
+                    operations.written += _size(arguments[1])
             return method(self, *arguments, **named)
 
         return call
@@ -58,7 +58,7 @@ def counted() -> Iterator[Operations]:
     for name, method in methods.items():
         setattr(Storage, name, wrapped(name, method))
     try:
-        yield found
+        yield operations
     finally:
         redis.connection.AbstractConnection.send_packed_command = send  # type: ignore[method-assign]  # as above
         for name, method in methods.items():

@@ -63,7 +63,7 @@ def seed(storage: Storage, count: int, chance: int = 0) -> Seeded:
 
 
 def _of(ids: Sequence[str], states: Sequence[str], state: str) -> list[str]:
-    return [name for name, found in zip(ids, states, strict=True) if found == state]
+    return [name for name, current in zip(ids, states, strict=True) if current == state]
 
 
 def _store(storage: Storage, number: int, name: str, state: str) -> None:

@@ -70,8 +70,8 @@ class Api:
                     cpu = time.process_time()
                     answer = await http.get("/v1/jobs", params={"state": state, "limit": 50})
                     cpu = time.process_time() - cpu
-                found = len(answer.raise_for_status().json()["jobs"])
-                return {"cpu_seconds": cpu, "round_trips": operations.round_trips, "found": found}
+                jobs = len(answer.raise_for_status().json()["jobs"])
+                return {"cpu_seconds": cpu, "round_trips": operations.round_trips, "found": jobs}
 
         return asyncio.run(ask())
 

@@ -74,7 +74,7 @@ class Cost:
     def described(self) -> list[str]:
         """Return the lines of the table of what one of each costs."""
         fleet, records = f"{self.workers} simulated workers", f"{self.records} records"
-        found = [
+        rows = [
             ("worker that waits", f"{100 * self.idle:.4f} % of a core of Redis", fleet),
             ("worker that trains", f"{100 * self.training:.3f} % of a core of Redis", fleet),
             ("worker that trains", f"{self.connections:.1f} connections to Redis", fleet),
@@ -86,7 +86,7 @@ class Cost:
             ("running job, with a full stream of progress", f"{self.running / 1e3:.0f} kB of Redis", fleet),
             ("ended job, with its capture and model", f"{self.kept / 1e3:.1f} kB of Redis", records),
         ]
-        return [f"| {what} | {costs} | {by} |" for what, costs, by in found]
+        return [f"| {what} | {costs} | {by} |" for what, costs, by in rows]
 
 
 def _scenarios(cost: Cost) -> list[str]:

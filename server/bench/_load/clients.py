@@ -142,14 +142,14 @@ def main() -> None:
     connected = {name: _row(name, entry) for name, entry in kept.items()}
     environment.stats.reset_all()
     gevent.sleep(_asked["seconds"])
-    found = {name: _row(name, entry) for name, entry in _entries(environment).items()}
+    rows = {name: _row(name, entry) for name, entry in _entries(environment).items()}
     errors = [
         {"name": error.name, "times": error.occurrences, "said": str(error.error)[:200]}
         for error in environment.stats.errors.values()
     ]
     # Streams open while the clients arrive.
-    found = {name: row for name, row in {**connected, **found}.items() if not name.startswith("stream")}
-    print(json.dumps({"requests": list(found.values()), "errors": errors}), flush=True)
+    rows = {name: row for name, row in {**connected, **rows}.items() if not name.startswith("stream")}
+    print(json.dumps({"requests": list(rows.values()), "errors": errors}), flush=True)
     runner.stop()
 
 

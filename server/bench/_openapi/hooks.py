@@ -79,10 +79,10 @@ def _existing(name: str, made_up: str, method: str) -> str:
     drawn = zlib.crc32(made_up.encode("utf-8", "surrogatepass"))
     if drawn % 2:
         return made_up
-    found = _ids().get(name, [])
+    ids = _ids().get(name, [])
     if method.upper() == "DELETE":
-        found = [one for one in found if one not in SERVICE["kept"].get(name, [])]
-    return found[drawn // 2 % len(found)] if found else made_up
+        ids = [one for one in ids if one not in SERVICE["kept"].get(name, [])]
+    return ids[drawn // 2 % len(ids)] if ids else made_up
 
 
 def _ids() -> dict[str, list[str]]:
@@ -95,7 +95,7 @@ def _ids() -> dict[str, list[str]]:
 
 def _look() -> dict[str, list[str]]:
     """Ask the service for the ids of its records, by the name of the path parameter."""
-    found: dict[str, list[str]] = {name: list(ids) for name, ids in SERVICE["kept"].items()}
+    by_name: dict[str, list[str]] = {name: list(ids) for name, ids in SERVICE["kept"].items()}
     headers = {"Authorization": f"Bearer {SERVICE['key']}"}
     with httpx.Client(base_url=SERVICE["url"], headers=headers, timeout=60, trust_env=False) as http:
         for name, path in (
@@ -110,5 +110,5 @@ def _look() -> dict[str, list[str]]:
                 if isinstance(listed, list)
                 else next(v for v in listed.values() if isinstance(v, list))
             )
-            found[name] = [*found.get(name, []), *(row["id"] for row in rows)]
-    return found | {"role": ["images", "masks", "poses"], "format": list(_FORMATS), "name": list(_FILES)}
+            by_name[name] = [*by_name.get(name, []), *(row["id"] for row in rows)]
+    return by_name | {"role": ["images", "masks", "poses"], "format": list(_FORMATS), "name": list(_FILES)}

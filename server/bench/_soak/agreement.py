@@ -21,7 +21,7 @@ def remains(connection: redis.Redis, storage: Storage) -> dict[str, list[str]]:
     """Return what is still held of work, where no job is unfinished, by what it is. Raises UnreadableRecord."""
     waiting = lines.look(connection)
     marks = [layout.unfinished_jobs(), layout.unfinished_imports(), layout.due_deliveries()]
-    found: dict[str, list[str]] = {
+    leftovers: dict[str, list[str]] = {
         "unfinished jobs": [job.decode() for job in cast(set[bytes], connection.smembers(keys.ACTIVE))],
         "leases": [lease.member for lease in leases.held(connection)],
         "waiting entries": [name for name in lines.LINES if waiting.count(name) > 0],
@@ -31,7 +31,7 @@ def remains(connection: redis.Redis, storage: Storage) -> dict[str, list[str]]:
             entry.path for entry in storage.walk(layout.jobs()) if "/work/" in entry.path
         ],
     }
-    return {what: held for what, held in found.items() if held}
+    return {what: held for what, held in leftovers.items() if held}
 
 
 def compare(
@@ -46,22 +46,22 @@ def compare(
         "jobs": _with(storage, layout.jobs(), "log.jsonl"),
         "models": _with(storage, layout.models(), "job.json"),
     }
-    found = [
+    differences = [
         f"the capture {lost} was accepted and is lost" for lost in sorted(set(accepted) - stored["captures"])
     ]
     kinds: tuple[lists.Kind, ...] = ("captures", "jobs", "models")
     for kind in kinds:
         indexed = _members(connection, lists.name(kind))
-        found += _differ(kind, stored[kind], set(indexed), "storage", "Redis")
-        found += _differ(kind, stored[kind], set(listed[kind]), "storage", "the API's list")
-        found += [f"{one} is listed {listed[kind].count(one)} times" for one in _doubled(listed[kind])]
+        differences += _differ(kind, stored[kind], set(indexed), "storage", "Redis")
+        differences += _differ(kind, stored[kind], set(listed[kind]), "storage", "the API's list")
+        differences += [f"{one} is listed {listed[kind].count(one)} times" for one in _doubled(listed[kind])]
     for job in sorted(stored["jobs"]):
-        found += _job(connection, storage, job, job in stored["models"])
+        differences += _job(connection, storage, job, job in stored["models"])
     for name in connection.scan_iter(match=f"{keys.PREFIX}job:*", count=1000):
         job_id = keys.job_of(name.decode())
         if job_id not in stored["jobs"]:
-            found.append(f"Redis holds {name.decode()}, and storage has no such job")
-    return found
+            differences.append(f"Redis holds {name.decode()}, and storage has no such job")
+    return differences
 
 
 def _job(connection: redis.Redis, storage: Storage, job: str, modelled: bool) -> list[str]:
@@ -87,19 +87,21 @@ def _job(connection: redis.Redis, storage: Storage, job: str, modelled: bool) ->
         accounts["its model"] = {
             name: record.get(name) for name in ("state", "generation", "capture", "owner")
         }
-    found = []
+    differences = []
     for place, account in accounts.items():
         for name, value in account.items():
             if value != accounts["Redis"][name]:
-                found.append(f"{name} of {job} is {value} in {place} and {accounts['Redis'][name]} in Redis")
+                differences.append(
+                    f"{name} of {job} is {value} in {place} and {accounts['Redis'][name]} in Redis"
+                )
     if modelled != (state == "succeeded"):
-        found.append(f"{job} is {state}, and storage has {'a' if modelled else 'no'} model of it")
+        differences.append(f"{job} is {state}, and storage has {'a' if modelled else 'no'} model of it")
     grouped = {
         group for group in lists.GROUPS if connection.zscore(lists.name("jobs", group=group), job) is not None
     }
     if grouped != {state}:
-        found.append(f"{job} is {state} and in the lists of {sorted(grouped)}")
-    return found
+        differences.append(f"{job} is {state} and in the lists of {sorted(grouped)}")
+    return differences
 
 
 def _with(storage: Storage, folder: str, name: str) -> set[str]:
@@ -114,8 +116,8 @@ def _members(connection: redis.Redis, name: str) -> list[str]:
 
 def _differ(kind: str, one: set[str], other: set[str], here: str, there: str) -> list[str]:
     return [
-        *(f"{kind}: {found} is in {here} and not in {there}" for found in sorted(one - other)),
-        *(f"{kind}: {found} is in {there} and not in {here}" for found in sorted(other - one)),
+        *(f"{kind}: {name} is in {here} and not in {there}" for name in sorted(one - other)),
+        *(f"{kind}: {name} is in {there} and not in {here}" for name in sorted(other - one)),
     ]
 
 

@@ -22,11 +22,11 @@ def got_on(lines: Iterable[Line], moment: float) -> dict[str, float]:
 
     To begin is not to get on: an attempt may begin again and again.
     """
-    found: dict[str, float] = {}
+    moments: dict[str, float] = {}
     for line in lines:
         if line["what"] in ("step", "stored", "end") and line["at"] > moment:
-            found.setdefault(line["job"], line["at"])
-    return found
+            moments.setdefault(line["job"], line["at"])
+    return moments
 
 
 def overlapping(lines: Iterable[Line]) -> list[str]:
@@ -45,7 +45,7 @@ def repeated(lines: Iterable[Line]) -> list[str]:
     Cameras are stored when the training begins, so no later attempt may recover them again, and so are the units of a
     scene in tiles when they are done.
     """
-    found: list[str] = []
+    sentences: list[str] = []
     units: set[tuple[str, str]] = set()
     stored: dict[str, int] = {}
     posed: dict[str, int] = {}
@@ -54,20 +54,20 @@ def repeated(lines: Iterable[Line]) -> list[str]:
         step: Any = line.get("step")
         if line["what"] == "resume":
             if step < stored.get(job, 0):
-                found.append(f"{job} was resumed from step {step} though step {stored[job]} was stored")
+                sentences.append(f"{job} was resumed from step {step} though step {stored[job]} was stored")
         elif line["what"] == "stored":
             if step < stored.get(job, 0):
-                found.append(f"{job} stored step {step} after step {stored[job]}")
+                sentences.append(f"{job} stored step {step} after step {stored[job]}")
             stored[job] = max(step, stored.get(job, 0))
         elif line["what"] == "unit stored":
             units.add((job, line["unit"]))
         elif line["what"] == "unit" and (job, line["unit"]) in units:
-            found.append(f"process {pid} did {line['unit']} of {job} again, which was stored")
+            sentences.append(f"process {pid} did {line['unit']} of {job} again, which was stored")
         elif line["what"] == "step" and line["stage"] == JobState.training and step is None:
             posed.setdefault(job, pid)
         elif line["what"] == "step" and line["stage"] == "mapping" and posed.get(job, pid) != pid:
-            found.append(f"process {pid} recovered the cameras of {job} again, which were stored")
-    return list(dict.fromkeys(found))
+            sentences.append(f"process {pid} recovered the cameras of {job} again, which were stored")
+    return list(dict.fromkeys(sentences))
 
 
 def resumptions(lines: Iterable[Line]) -> int:

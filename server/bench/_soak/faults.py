@@ -207,9 +207,9 @@ def schedule(
         chosen += [kill_of(name.removesuffix(_KILLED)) for name in only if name not in names]
         rng.shuffle(chosen)
         return chosen
-    found: list[Fault] = []
-    while len(found) < count:
+    plan: list[Fault] = []
+    while len(plan) < count:
         deck = [fault for fault in faults for _ in range(fault.weight)]
         rng.shuffle(deck)
-        found += deck
-    return found[:count]
+        plan += deck
+    return plan[:count]

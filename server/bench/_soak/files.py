@@ -33,32 +33,32 @@ def halves(promises: Iterable[Promise], storage: Storage) -> list[str]:
 
     A model that was made without some of its photos is not whole.
     """
-    found = []
+    sentences = []
     for promise in promises:
         for name, content in promise.files.items():
             role, _, file = name.partition("/")
             path = layout.capture_file(promise.capture, Role(role), file)
             try:
                 if storage.get(path) != content:
-                    found.append(f"{path} is not what was uploaded")
+                    sentences.append(f"{path} is not what was uploaded")
             except FileNotFoundError:
-                found.append(f"{path} was uploaded and is missing")
+                sentences.append(f"{path} was uploaded and is missing")
         if promise.state != "succeeded":
             continue
         try:
             record = json.loads(storage.get(layout.job_record(promise.job)))
             cameras = json.loads(storage.get(layout.model_file(promise.job, "cameras.json")))["cameras"]
         except (FileNotFoundError, ValueError) as error:
-            found.append(f"the record of the model {promise.job} cannot be read: {error}")
+            sentences.append(f"the record of the model {promise.job} cannot be read: {error}")
             continue
         if len(cameras) != promise.photos:
-            found.append(f"{promise.job} was made of {len(cameras)} photos, not of {promise.photos}")
-        found += _not_whole(promise.job, record, storage)
-    return found
+            sentences.append(f"{promise.job} was made of {len(cameras)} photos, not of {promise.photos}")
+        sentences += _not_whole(promise.job, record, storage)
+    return sentences
 
 
 def _not_whole(model: str, record: Mapping[str, Any], storage: Storage) -> list[str]:
-    found = []
+    sentences = []
     for name, digest in record["sha256"].items():
         path = layout.model_file(model, name)
         try:
@@ -66,28 +66,28 @@ def _not_whole(model: str, record: Mapping[str, Any], storage: Storage) -> list[
         except FileNotFoundError:
             whole = False
         if not whole:
-            found.append(f"{path} is not whole")
-    return found
+            sentences.append(f"{path} is not whole")
+    return sentences
 
 
 def strays(storage: Storage) -> list[str]:
     """Return a sentence for each file that nothing explains once no job runs, or that cannot be read."""
-    found = []
+    sentences = []
     entries = {entry.path: entry for entry in storage.walk("")}
     for path, entry in sorted(entries.items()):
         if not any(re.fullmatch(pattern, path) for pattern in _EXPECTED):
-            found.append(f"{path} is in storage, where no job runs and nothing is being uploaded")
+            sentences.append(f"{path} is in storage, where no job runs and nothing is being uploaded")
         elif (fault := _fault(entry, entries, storage)) is not None:
-            found.append(f"{path} {fault}")
+            sentences.append(f"{path} {fault}")
     if storage.root is not None:
         files = [path for path in storage.root.rglob("*") if path.is_file()]
         unlisted = {path.relative_to(storage.root).as_posix() for path in files} - entries.keys()
-        found += [
+        sentences += [
             f"{path} is a file that storage does not list"
             for path in sorted(unlisted)
             if not _STAGED.search(path)
         ]
-    return found
+    return sentences
 
 
 def _fault(entry: Entry, entries: Mapping[str, Entry], storage: Storage) -> str | None:

@@ -37,11 +37,11 @@ class Adoption:
         """
         if self.missing is not None:
             return []
-        given = {child.pid for child in psutil.Process().children()} - self.own - set(own)
-        for pid in given:
+        pids = {child.pid for child in psutil.Process().children()} - self.own - set(own)
+        for pid in pids:
             with suppress(ChildProcessError):
                 os.waitpid(pid, os.WNOHANG)  # one that has ended waits for this
-        return sorted(pid for pid in given if start_time(pid) is not None)
+        return sorted(pid for pid in pids if start_time(pid) is not None)
 
     def _set(self, value: int) -> None:
         if self.missing is None:

@@ -131,7 +131,7 @@ class Processes:
 
     def _tree(self) -> list[Member]:
         """Return the processes below this one but for its own, each after its parent."""
-        found: dict[int, Member] = {}
+        members: dict[int, Member] = {}
         commands: dict[int, list[str]] = {}
         children: dict[int, list[psutil.Process]] = {}
         for process in psutil.Process().children(recursive=True):
@@ -145,14 +145,14 @@ class Processes:
                 command, began = process.cmdline(), start_time(process.pid)
                 parent = process.ppid()
                 if command and began is not None:
-                    above = found.get(parent)
+                    above = members.get(parent)
                     role = role_of(command, commands.get(parent, ()), above.line[-1] if above else None)
                     line = (*above.line, role) if above else (role,)
                     pids = (*above.above, above.pid) if above else ()
-                    found[process.pid] = Member(process.pid, began, line, pids)
+                    members[process.pid] = Member(process.pid, began, line, pids)
                     commands[process.pid] = command
                 waiting += children.get(process.pid, ())
-        return list(found.values())
+        return list(members.values())
 
 
 def role_of(command: Sequence[str], parent_command: Sequence[str], parent: str | None) -> str:

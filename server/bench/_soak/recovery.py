@@ -33,23 +33,23 @@ def recover(
     struck, healed: monotonic times of the fault's beginning and end.
     """
     within = RESUME_SECONDS * service.patience
-    found: dict[str, float] = {}
+    seconds: dict[str, float] = {}
     waited: dict[str, Callable[[], bool | float]] = {
         "answers": service.ready,
         "accepts": lambda: accepts(service, clients),
         "shows": lambda: shows(service, clients),
         "resumes": lambda: resumed(service, clients, struck, healed),
     }
-    while len(found) < len(waited) and time.monotonic() < healed + within:
-        for what in [what for what in waited if what not in found]:
+    while len(seconds) < len(waited) and time.monotonic() < healed + within:
+        for what in [what for what in waited if what not in seconds]:
             if (when := waited[what]()) is not False:
-                found[what] = (time.monotonic() if when is True else when) - healed
+                seconds[what] = (time.monotonic() if when is True else when) - healed
         time.sleep(_PAUSE)
     orphans = service.orphans()
     while orphans and time.monotonic() < healed + within:
         time.sleep(_PAUSE)
         orphans = service.orphans()
-    late = [what for what in waited if found.get(what, within) >= within]
+    late = [what for what in waited if seconds.get(what, within) >= within]
     complaint = None
     if late:
         complaint = f"After {within:g} s the service does not do this: {', '.join(late)}."
@@ -58,7 +58,7 @@ def recover(
             complaint += f" It has not resumed {sorted(waiting) or 'any job'}."
     elif orphans:
         complaint = f"These processes have lost their parent and run on: {[command(pid) for pid in orphans]}."
-    return found, complaint
+    return seconds, complaint
 
 
 def accepts(service: Service, clients: Clients) -> bool:

@@ -251,7 +251,7 @@ class Service:
             checks = self.http.get("/readyz", timeout=3).json()["checks"]
         except (httpx.HTTPError, ValueError, KeyError):
             return False
-        return all(found == "ok" for found in checks.values())
+        return all(check == "ok" for check in checks.values())
 
     def records(self) -> list[Any]:
         """Return all lines of the pipelines' record (see `pipeline`)."""

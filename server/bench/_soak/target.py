@@ -105,10 +105,10 @@ class Target:
 
     def _find(self, role: str) -> Member | None:
         """Return a process of this role at a moment to kill it; None if there is none, or it is spared."""
-        found = self.service.running(role)
-        if not found:
+        members = self.service.running(role)
+        if not members:
             return None
-        member = self.rng.choice(found)
+        member = self.rng.choice(members)
         if not self._may(member):
             return None
         if TRAINER in member.line[:-1]:

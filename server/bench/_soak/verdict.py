@@ -71,13 +71,13 @@ def check_stopped(service: Service) -> list[str]:
 
 def met(service: Service, target: Target) -> list[str]:
     """Return a sentence for each thing that a whole soak should have met, and has not."""
-    found = [
+    sentences = [
         f"a process was met and never killed: the {role}"
         for role in sorted(service.processes.roles - target.killed.keys() - STARTED_BY_THE_SOAK)
     ]
     if not attempts.resumptions(service.records()):
-        found.append("no attempt trained on from a checkpoint")
-    return found
+        sentences.append("no attempt trained on from a checkpoint")
+    return sentences
 
 
 def lost(clients: Clients, jobs: list[str], models: list[str]) -> list[str]:
@@ -85,22 +85,22 @@ def lost(clients: Clients, jobs: list[str], models: list[str]) -> list[str]:
 
     jobs, models: ids of those that the API lists.
     """
-    found = []
+    sentences = []
     for promise in clients.promises.values():
         if promise.failure is not None:
-            found.append(f"{promise.job} failed: {promise.failure}")
+            sentences.append(f"{promise.job} failed: {promise.failure}")
         elif promise.state in FINAL:  # `settle` judges the others
             if promise.job not in jobs:
-                found.append(f"{promise.job} was accepted and is not among the jobs")
+                sentences.append(f"{promise.job} was accepted and is not among the jobs")
             if (promise.state == "succeeded") != (promise.job in models):
                 there = "is" if promise.job in models else "is not"
-                found.append(f"{promise.job} is {promise.state} and {there} among the models")
-    return found
+                sentences.append(f"{promise.job} is {promise.state} and {there} among the models")
+    return sentences
 
 
 def _unread(service: Service, clients: Clients) -> list[str]:
     """Models that a client cannot download as they are in storage, or cannot look at."""
-    found = []
+    sentences = []
     for promise in clients.promises.values():
         if promise.state != "succeeded":
             continue
@@ -108,13 +108,13 @@ def _unread(service: Service, clients: Clients) -> list[str]:
         record = service.http.get(f"{address}/files/job.json")
         model = service.http.get(f"{address}/files/model.ply")
         if record.status_code != 200 or model.status_code != 200:
-            found.append(f"{address} cannot be downloaded: {record.status_code}, {model.status_code}")
+            sentences.append(f"{address} cannot be downloaded: {record.status_code}, {model.status_code}")
         elif hashlib.sha256(model.content).hexdigest() != record.json()["sha256"]["model.ply"]:
-            found.append(f"{address}/files/model.ply is not what its record says")
+            sentences.append(f"{address}/files/model.ply is not what its record says")
         view = service.http.post(f"{address}/render", json={"camera": CAMERA})
         if not view.content.startswith(b"\x89PNG"):
-            found.append(f"{address} cannot be looked at: {view.status_code} {view.text[:200]}")
-    return found
+            sentences.append(f"{address} cannot be looked at: {view.status_code} {view.text[:200]}")
+    return sentences
 
 
 def _listed(service: Service, what: str) -> list[str]:
@@ -136,13 +136,13 @@ def _listed(service: Service, what: str) -> list[str]:
 
 def told_twice(connection: redis.Redis, jobs: set[str]) -> list[str]:
     """Return a sentence for each job whose states tell more than once in a generation that it has succeeded."""
-    found = []
+    sentences = []
     for job in sorted(jobs):
         stored = events.read_states(connection, job)
         told = [s for s in stored if isinstance(s.event, StateEvent) and s.event.state == "succeeded"]
         if len(told) > len({s.generation for s in told}):
-            found.append(f"{job} was told to have succeeded {len(told)} times")
-    return found
+            sentences.append(f"{job} was told to have succeeded {len(told)} times")
+    return sentences
 
 
 def _agreed(
@@ -154,23 +154,23 @@ def _agreed(
         listed = {kind: _listed(service, kind) for kind in ("captures", "jobs", "models")}
         try:
             held = agreement.remains(connection, storage)
-            found = [f"there are still {what}: {names}" for what, names in held.items()]
-            found += agreement.compare(connection, storage, listed, clients.captures)
+            differences = [f"there are still {what}: {names}" for what, names in held.items()]
+            differences += agreement.compare(connection, storage, listed, clients.captures)
         except UnreadableRecord as error:
-            found = [f"Redis holds a record that cannot be read: {error}"]
-        if not found or time.monotonic() > end:
-            return listed, found
+            differences = [f"Redis holds a record that cannot be read: {error}"]
+        if not differences or time.monotonic() > end:
+            return listed, differences
         time.sleep(1)
 
 
 def _marked(trace: Path) -> list[int]:
     """Return the processes whose environment names the record of this soak."""
     mark = f"SOAK_TRACE={trace}".encode()
-    found = []
+    pids = []
     for folder in Path("/proc").glob("[0-9]*"):
         try:
             if mark in (folder / "environ").read_bytes().split(b"\0"):
-                found.append(int(folder.name))
+                pids.append(int(folder.name))
         except OSError:
             continue
-    return found
+    return pids

@@ -74,12 +74,12 @@ def opened(
     page = browser.new_page()
     page.route("**/*", answer)
     page.goto(ADDRESS)
-    found = page.evaluate(OPEN, [*eye])
+    facts = page.evaluate(OPEN, [*eye])
     picture = page.locator("canvas").screenshot()
     page.close()
     if folder := os.environ.get("SPLATMILL_SCREENSHOTS"):
-        (Path(folder) / f"three-{found['triangles']}.png").write_bytes(picture)
-    return found, Image.open(io.BytesIO(picture)).convert("RGB")
+        (Path(folder) / f"three-{facts['triangles']}.png").write_bytes(picture)
+    return facts, Image.open(io.BytesIO(picture)).convert("RGB")
 
 
 @pytest.mark.parametrize("textured", [False, True])
@@ -100,9 +100,9 @@ def test_three_js_shows_a_mesh_upright_in_its_colours(
             vertices, faces, None, np.concatenate([uvs, uvs + np.array([0, 0.55], np.float32)]), picture_of
         )
     glb.write(tmp_path / "mesh.glb", mesh, (0.0, 0.0, 0.0))
-    found, picture = opened(browser, (tmp_path / "mesh.glb").read_bytes(), (0.0, 0.0, 1.0))
-    assert (found["triangles"], found["material"], found["textured"]) == (4, "MeshBasicMaterial", textured)
-    assert (found["min"], found["max"]) == ([-1, -1, -1], [1, 1, -1])
+    facts, picture = opened(browser, (tmp_path / "mesh.glb").read_bytes(), (0.0, 0.0, 1.0))
+    assert (facts["triangles"], facts["material"], facts["textured"]) == (4, "MeshBasicMaterial", textured)
+    assert (facts["min"], facts["max"]) == ([-1, -1, -1], [1, 1, -1])
     for row, expected in ((150, (30, 160, 60)), (210, (200, 40, 30))):
         shown = picture.getpixel((240, row))
         assert isinstance(shown, tuple)
@@ -137,9 +137,9 @@ def test_a_mesh_is_made_by_its_button_saved_and_opened(
     with page.expect_download() as downloading:
         save.click()
     downloading.value.save_as(tmp_path / "mesh.glb")
-    found, picture = opened(browser, (tmp_path / "mesh.glb").read_bytes(), (0.6, 0.6, 0.6))
+    facts, picture = opened(browser, (tmp_path / "mesh.glb").read_bytes(), (0.6, 0.6, 0.6))
     (made,) = service.http.get(f"/v1/models/{model.id}/meshes").json()["meshes"]
-    assert found["triangles"] == made["facts"]["triangles"]
+    assert facts["triangles"] == made["facts"]["triangles"]
     pixels = np.asarray(picture).reshape(-1, 3)
     drawn = pixels[(pixels < 250).any(1)]
     assert len(drawn) > 0.02 * len(pixels)

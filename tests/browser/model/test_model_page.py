@@ -80,9 +80,9 @@ def test_the_model_is_compared_with_its_held_out_photos(service: Up, model: Smal
         figures = f"{name}: PSNR {camera['psnr']:.1f} dB, SSIM {camera['ssim']:.3f}"
         expect(section.locator("figcaption")).to_have_text(figures)
         sizes = """() => [...document.querySelectorAll('.pair img')].map((i) => [i.naturalWidth, i.naturalHeight])"""
-        wanted = [camera["camera"]["width"], camera["camera"]["height"]]
+        size = [camera["camera"]["width"], camera["camera"]["height"]]
         shown.wait_for_function(
-            f"([w, h]) => ({sizes})().every(([x, y]) => x === w && y === h)", arg=wanted, polling=100
+            f"([w, h]) => ({sizes})().every(([x, y]) => x === w && y === h)", arg=size, polling=100
         )
     error = """() => {
           const [render, photo] = [...document.querySelectorAll(".pair img")].map((image) => {
@@ -296,8 +296,10 @@ def test_assistive_technology_finds_nothing_serious(
     show(page, model)
     page.get_by_role("button", name="Measure").click()
     page.evaluate((npm_package("axe-core") / "axe.min.js").read_text())
-    found = page.evaluate("axe.run().then((result) => result.violations)")
-    serious = [f"{v['id']}: {v['nodes'][0]['html']}" for v in found if v["impact"] in ("serious", "critical")]
+    problems = page.evaluate("axe.run().then((result) => result.violations)")
+    serious = [
+        f"{v['id']}: {v['nodes'][0]['html']}" for v in problems if v["impact"] in ("serious", "critical")
+    ]
     assert not serious
 
 
@@ -391,10 +393,10 @@ def test_a_model_that_is_deleted_elsewhere_says_so(
     service: Up, model: SmallModel, shown: Page, visit: Visit
 ) -> None:
     visit.watched.allow("Failed to load resource")
-    seen = "document.dispatchEvent(new Event('visibilitychange'))"
+    revisit = "document.dispatchEvent(new Event('visibilitychange'))"
     service.http.put(f"/v1/bin/jobs/{model.id}").raise_for_status()
     try:
-        shown.evaluate(seen)
+        shown.evaluate(revisit)
         notice = shown.locator("#problem")
         expect(notice).to_contain_text("This model is in the bin, and deleted for good in 23 hours.")
         shown.reload()
@@ -404,7 +406,7 @@ def test_a_model_that_is_deleted_elsewhere_says_so(
     finally:
         service.http.delete(f"/v1/bin/jobs/{model.id}")
     shown.route(f"**/v1/models/{model.id}", lambda route: route.fulfill(status=404, json=GONE))
-    shown.evaluate(seen)
+    shown.evaluate(revisit)
     expect(notice).to_contain_text("There is no model")
 
 

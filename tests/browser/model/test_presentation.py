@@ -78,14 +78,14 @@ def test_visitors_begin_with_the_view_that_was_chosen(
     visitor.wait_for_function(SHOWN)
     visitor.evaluate("document.querySelectorAll('.view-bar, .said').forEach((element) => element.remove())")
     with Image.open(io.BytesIO(visitor.locator("#view .view").screenshot())) as shot:
-        seen = shot.convert("RGB")
+        frame = shot.convert("RGB")
     answer = service.http.get(f"/v1/models/{model.id}/files/poster.jpg")
     with Image.open(io.BytesIO(answer.content)) as poster:
-        scale = min(seen.width / poster.width, seen.height / poster.height)
-        wanted = poster.convert("RGB").resize((round(poster.width * scale), round(poster.height * scale)))
-    left, top = (seen.width - wanted.width) // 2, (seen.height - wanted.height) // 2
-    inside = seen.crop((left, top, left + wanted.width, top + wanted.height))
-    error = np.square(np.asarray(inside) / 255.0 - np.asarray(wanted) / 255.0).mean()
+        scale = min(frame.width / poster.width, frame.height / poster.height)
+        target = poster.convert("RGB").resize((round(poster.width * scale), round(poster.height * scale)))
+    left, top = (frame.width - target.width) // 2, (frame.height - target.height) // 2
+    inside = frame.crop((left, top, left + target.width, top + target.height))
+    error = np.square(np.asarray(inside) / 255.0 - np.asarray(target) / 255.0).mean()
     assert -10 * math.log10(error) > 28, "the first frame is what the picture shows"
     page.reload()
     expect(page.locator("#viewer[data-ready]")).to_be_visible(timeout=WAIT)

@@ -67,7 +67,7 @@ def module(page: Page) -> str:
 def test_the_page_and_the_renderer_select_the_same(panel: Locator, page: Page) -> None:
     means, strokes = random_strokes(7, gaussians=20_000, strokes=24)
     plain = [stroke.model_dump(mode="json", exclude_none=True) for stroke in strokes]
-    found, masks = page.evaluate(
+    per_stroke, masks = page.evaluate(
         """async ({ address, means, strokes }) => {
           const { within, maskOf } = await import(address);
           const centers = new Float32Array(means);
@@ -77,9 +77,9 @@ def test_the_page_and_the_renderer_select_the_same(panel: Locator, page: Page) -
         }""",
         {"address": module(page), "means": means.ravel().tolist(), "strokes": plain},
     )
-    for stroke, inside in zip(strokes, found, strict=True):
+    for stroke, inside in zip(strokes, per_stroke, strict=True):
         assert inside == sorted(within(means, stroke).tolist())
-    assert sum(map(len, found)) > 1000
+    assert sum(map(len, per_stroke)) > 1000
     for inverted, mask in zip((False, True), masks, strict=True):
         chosen = selected(means, Selection(strokes=strokes, inverted=inverted))
         assert np.array_equal(np.array(mask[: len(means)]) == 255, chosen)

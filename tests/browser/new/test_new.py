@@ -139,24 +139,24 @@ def test_photos_of_one_kind_are_not_told_apart(page: Page, photos: Path, tmp_pat
 
 
 def test_a_panorama_is_known_before_the_upload(page: Page, photos: Path, tmp_path: Path) -> None:
-    given = tmp_path / "given"
+    folder = tmp_path / "given"
     of_all = {"ProjectionType": "equirectangular"}
     part = of_all | {
         f"{name}HeightPixels": size for name, size in (("CroppedAreaImage", 115), ("FullPano", 256))
     }
-    striped(given / "stated.jpg", gpano(**of_all), seed=1)
-    striped(given / "edges.jpg", seed=3)
-    striped(given / "part.jpg", gpano(**part), seed=5)
-    striped(given / "cylinder.jpg", gpano(ProjectionType="cylindrical"), seed=7)
+    striped(folder / "stated.jpg", gpano(**of_all), seed=1)
+    striped(folder / "edges.jpg", seed=3)
+    striped(folder / "part.jpg", gpano(**part), seed=5)
+    striped(folder / "cylinder.jpg", gpano(ProjectionType="cylindrical"), seed=7)
     first = sorted(photos.iterdir())[0]
-    Image.open(first).resize((512, 256)).save(given / "wide.jpg")
+    Image.open(first).resize((512, 256)).save(folder / "wide.jpg")
     # The worker decides alike.
     reasons = {}
-    for path in given.iterdir():
+    for path in folder.iterdir():
         with Image.open(path) as image:
             reasons[path.stem] = stated(image) or by_edges(image)
     assert (reasons["stated"], reasons["edges"], reasons["wide"]) == ("stated", "closed", "")
-    give(opened(page), given)
+    give(opened(page), folder)
     for name in ("stated", "edges"):
         verdict = tile(page, f"{name}.jpg").locator(".verdict")
         expect(verdict).to_have_text("360-degree photo: it is cut into six views.")
@@ -395,7 +395,7 @@ def test_one_job_is_made_of_two_clicks_and_of_a_lost_answer(
     assert len(keys) == 2
     assert len(set(keys)) == 1
     of_capture = service.http.get("/v1/jobs", params={"capture": job["capture"]}).json()["jobs"]
-    assert [found["id"] for found in of_capture] == [job["id"]]
+    assert [each["id"] for each in of_capture] == [job["id"]]
 
 
 def test_settings_have_the_help_of_the_command_line_and_errors_beside_them(
@@ -488,26 +488,26 @@ def test_a_refused_file_is_named_and_the_others_can_be_trained(
     visit: Visit, service: Up, photos: Path, jobs: None
 ) -> None:
     visit.watched.allow("status of 409")
-    given = sorted(photos.iterdir())[:3]
+    paths = sorted(photos.iterdir())[:3]
     capture = service.http.post("/v1/captures", json={"name": "taken"}).json()["id"]
-    other = given[2].read_bytes() + b"\0"
-    service.http.put(f"/v1/captures/{capture}/images/{given[0].name}", content=other)
+    other = paths[2].read_bytes() + b"\0"
+    service.http.put(f"/v1/captures/{capture}/images/{paths[0].name}", content=other)
     page = opened(visit.page, f"/?capture={capture}")
-    give(page, *given)
+    give(page, *paths)
     page.get_by_role("button", name="Upload and train").click()
     expect(page.locator("#problem")).to_contain_text("The server refused 1 file", timeout=CHECKED)
-    expect(tile(page, given[0].name).locator(".verdict")).to_contain_text(
+    expect(tile(page, paths[0].name).locator(".verdict")).to_contain_text(
         "already holds images/still_00.jpg with other bytes"
     )
     page.get_by_role("button", name="Train without it").click()
     job = started(page, service)
     assert job["capture"] == capture
-    names = [f"images/{path.name}" for path in given]
+    names = [f"images/{path.name}" for path in paths]
     files = files_of(service, capture)
     assert files == {
         names[0]: hashlib.sha256(other).hexdigest(),
-        names[1]: digest(given[1]),
-        names[2]: digest(given[2]),
+        names[1]: digest(paths[1]),
+        names[2]: digest(paths[2]),
     }
 
 
@@ -595,6 +595,6 @@ def test_axe_finds_nothing_serious(service: Up, open_window: Open, photos: Path)
     expect(page.locator("#estimate")).not_to_be_empty()
     for theme, rules in (("light", "axe.run()"), ("dark", "axe.run({ runOnly: ['color-contrast'] })")):
         page.get_by_label("Theme").select_option(theme)
-        found = page.evaluate(rules)["violations"]
-        serious = [one for one in found if one["impact"] in ("serious", "critical")]
+        problems = page.evaluate(rules)["violations"]
+        serious = [one for one in problems if one["impact"] in ("serious", "critical")]
         assert not serious, json.dumps(serious, indent=1)[:3000]

@@ -152,11 +152,11 @@ def test_files_are_sorted_as_by_the_command_line(page: Page, tmp_path: Path) -> 
             with pytest.raises(NothingToUpload, match=re.escape(here["problem"])):
                 find_files(root)
             continue
-        found = find_files(root)
+        upload = find_files(root)
         listed = [(file["role"], file["name"], file["path"]) for file in here["files"]]
         assert listed == [
-            (file.role.value, file.name, file.path.relative_to(root).as_posix()) for file in found.files
+            (file.role.value, file.name, file.path.relative_to(root).as_posix()) for file in upload.files
         ], title
-        assert here["ignored"] == list(found.ignored), title
-        assert here["outputs"] == list(found.outputs), title
-        assert here["remarks"] == list(found.remarks), title
+        assert here["ignored"] == list(upload.ignored), title
+        assert here["outputs"] == list(upload.outputs), title
+        assert here["remarks"] == list(upload.remarks), title

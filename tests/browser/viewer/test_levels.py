@@ -65,8 +65,8 @@ def large(service: Up, model: SmallModel) -> Iterator[str]:
     models = service.data / "storage/models"
     large = models / secrets.token_hex(8)
     shutil.copytree(models / model.id, large, ignore=shutil.ignore_patterns("formats", "orbits", "meshes"))
-    found = ply.read(large / "model.ply")
-    ply.write(large / "model.ply", _many(found.gaussians), offset=found.offset)
+    scene = ply.read(large / "model.ply")
+    ply.write(large / "model.ply", _many(scene.gaussians), offset=scene.offset)
     record = json.loads((large / "job.json").read_text())
     (large / "job.json").write_text(
         json.dumps(record | {"id": large.name, "model": large.name, "sha256": {}})
@@ -77,7 +77,7 @@ def large(service: Up, model: SmallModel) -> Iterator[str]:
     shutil.rmtree(large)
 
 
-def _seen(page: Page) -> npt.NDArray[np.float64]:
+def _picture(page: Page) -> npt.NDArray[np.float64]:
     with Image.open(io.BytesIO(page.locator(".view canvas").first.screenshot())) as shown:
         return np.asarray(shown.convert("RGB")) / 255.0
 
@@ -108,7 +108,7 @@ def test_the_first_picture_comes_from_few_bytes_and_the_last_is_that_of_the_whol
     page.wait_for_function(SETTLED)
     parts = [line for line in asked if line.startswith("GET") and line.endswith("/download/lod.zip")]
     assert len(parts) == 1 + len(_ranges(service, large)), "the end, and each chunk once"
-    in_parts = _seen(page)
+    in_parts = _picture(page)
 
     # An edit needs to know where each Gaussian is: the whole model takes the place of its parts.
     assert not [line for line in asked if line.endswith("/download/sog")]
@@ -120,7 +120,7 @@ def test_the_first_picture_comes_from_few_bytes_and_the_last_is_that_of_the_whol
     expect(page.get_by_text(re.compile(r"[1-9][\d,]* of 26[\d,]+ Gaussians are selected"))).to_be_visible()
     page.get_by_role("button", name="Crop and clean").click()
     page.evaluate("scrollTo(0, 0)")  # the view is where it was
-    wait_for(lambda: _psnr(_seen(page), in_parts) > 35)
+    wait_for(lambda: _psnr(_picture(page), in_parts) > 35)
 
 
 def _ranges(service: Up, large: str) -> list[str]:
@@ -144,9 +144,9 @@ def test_a_link_shows_it_in_parts_and_a_part_that_fails_is_asked_for_again(
     asked: list[tuple[str, str, float]] = []
 
     def sometimes(route: Route) -> None:
-        wanted = route.request.headers.get("range", "bytes=-")
-        failure = failures.pop(0) if failures and not wanted.startswith("bytes=-") else ""
-        asked.append((wanted, failure, time.monotonic()))
+        span = route.request.headers.get("range", "bytes=-")
+        failure = failures.pop(0) if failures and not span.startswith("bytes=-") else ""
+        asked.append((span, failure, time.monotonic()))
         if failure == "lost":
             route.abort()
         elif failure == "busy":
@@ -160,7 +160,7 @@ def test_a_link_shows_it_in_parts_and_a_part_that_fails_is_asked_for_again(
     visit.page.wait_for_function(SETTLED)
     expect(visit.page.locator(".view .said")).to_be_empty()
     for part, failure, at in asked:
-        later = [then for wanted, _, then in asked if wanted == part and then > at]
+        later = [then for other, _, then in asked if other == part and then > at]
         assert bool(later) == bool(failure), "what failed is asked for again, and nothing else"
         assert failure != "busy" or later[0] - at > 1.5, "not before the server says"
 
@@ -186,7 +186,7 @@ def test_a_link_shows_it_in_parts_and_a_part_that_fails_is_asked_for_again(
     visit.page.locator(".view").press("ArrowLeft")
     visit.page.locator(".view").press("w")
     expect(visit.page.locator(".view .said")).to_contain_text("the server answered 404")
-    assert len(set(np.round(_seen(visit.page) * 255).astype(int).flatten())) > 100, (
+    assert len(set(np.round(_picture(visit.page) * 255).astype(int).flatten())) > 100, (
         "the coarsest level is drawn"
     )
 
@@ -239,4 +239,4 @@ def test_a_file_in_parts_is_opened_and_what_is_none_is_refused_by_name(
     page.get_by_label("Choose a file").set_input_files(tmp_path / "mine.lod.zip")
     expect(page.get_by_role("heading", level=1)).to_have_text("mine.lod.zip")
     page.wait_for_function(SETTLED)
-    assert len(set(np.round(_seen(page) * 255).astype(int).flatten())) > 100
+    assert len(set(np.round(_picture(page) * 255).astype(int).flatten())) > 100

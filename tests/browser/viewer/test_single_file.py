@@ -87,6 +87,6 @@ def test_the_file_draws_the_model_and_asks_for_nothing(
     finally:
         context.close()
     with torch.no_grad():
-        wanted = render(scene, camera_of(spec), background=(0, 0, 0)).color.clamp(0, 1).numpy()
-    assert wanted.std() > 0.1
-    assert -10 * np.log10(np.square(shown - wanted).mean()) > FLOOR
+        reference = render(scene, camera_of(spec), background=(0, 0, 0)).color.clamp(0, 1).numpy()
+    assert reference.std() > 0.1
+    assert -10 * np.log10(np.square(shown - reference).mean()) > FLOOR

@@ -79,8 +79,10 @@ def test_the_picture_comes_first_and_the_scene_from_few_bytes(
     asked = requests(page)
     page.goto(address, wait_until="commit")
     # An image has its width as soon as its head has come.
-    seen = f"[...document.querySelectorAll('{box} img')].some((img) => img.complete && img.naturalWidth > 0)"
-    page.wait_for_function(f"() => {seen}", polling=50)
+    condition = (
+        f"[...document.querySelectorAll('{box} img')].some((img) => img.complete && img.naturalWidth > 0)"
+    )
+    page.wait_for_function(f"() => {condition}", polling=50)
     assert sum(loaded) < PICTURE[where], "the picture comes before the engine"
     # A picture that has come is shown once it is decoded, and the page moves once more when its title comes.
     (poster,) = wait_for(lambda: unmoved(page.locator(box)))

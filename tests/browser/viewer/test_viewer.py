@@ -90,12 +90,12 @@ def pixels(page: Page) -> npt.NDArray[np.float64]:
 
 
 def camera(page: Page) -> dict[str, Any]:
-    found: dict[str, Any] = page.evaluate("view.getCamera()")
-    return found
+    spec: dict[str, Any] = page.evaluate("view.getCamera()")
+    return spec
 
 
-def rendered(http: httpx.Client, model: SmallModel, seen: dict[str, Any]) -> npt.NDArray[np.float64]:
-    answer = http.post(f"/v1/models/{model.id}/render", json={"camera": seen})
+def rendered(http: httpx.Client, model: SmallModel, view: dict[str, Any]) -> npt.NDArray[np.float64]:
+    answer = http.post(f"/v1/models/{model.id}/render", json={"camera": view})
     assert answer.status_code == 200, answer.text
     with Image.open(io.BytesIO(answer.content)) as picture:
         return np.asarray(picture.convert("RGB")) / 255.0
@@ -186,28 +186,28 @@ def replaced(page: Page, content: bytes) -> list[str] | None:
 def test_every_format_is_drawn_from_addresses_and_from_bytes(
     service: Up, model: SmallModel, shown: Page, tmp_path: Path
 ) -> None:
-    wanted = rendered(service.http, model, camera(shown))
+    reference = rendered(service.http, model, camera(shown))
     count = shown.evaluate("view.gaussians")
-    assert psnr(pixels(shown), wanted) > FLOOR
+    assert psnr(pixels(shown), reference) > FLOOR
     for format, way in (("compressed.ply", "address"), ("sog", "address"), ("sog", "bytes")):
         address = f"/v1/models/{model.id}/download/{format}"
         # Between two models nothing is drawn that could pass for the second one.
         shown.evaluate("view.surface.splats.enabled = false; view.again()")
         rest(shown)
-        assert psnr(pixels(shown), wanted) < 20
+        assert psnr(pixels(shown), reference) < 20
         if way == "bytes":
             assert replaced(shown, service.http.get(address).content) is None
         else:
             shown.evaluate("(url) => view.replace({ url })", address)
         rest(shown)
-        assert psnr(pixels(shown), wanted) > FLOOR, (format, way)
+        assert psnr(pixels(shown), reference) > FLOOR, (format, way)
         assert 0.9 * count < shown.evaluate("view.gaussians") <= count, format
     source, foreign = tmp_path / "model.ply", tmp_path / "foreign.sog"
     source.write_bytes(service.http.get(f"/v1/models/{model.id}/files/model.ply").content)
     splat_transform.convert(source, foreign, "-g", "cpu")
     assert replaced(shown, foreign.read_bytes()) is None
     rest(shown)
-    assert psnr(pixels(shown), wanted) > FLOOR
+    assert psnr(pixels(shown), reference) > FLOOR
 
 
 def changed(archive: bytes, **members: bytes | None) -> bytes:
@@ -370,17 +370,17 @@ def test_without_cameras_the_dense_middle_is_seen_upright(
     service: Up, model: SmallModel, visit: Visit
 ) -> None:
     assert mount(visit.page, model, cameras=[]) == "webgl"
-    seen = camera(visit.page)
+    view = camera(visit.page)
     points = np.array(visit.page.evaluate("[...view.surface.points]")).reshape(-1, 3)
     assert len(points) == visit.page.evaluate("view.gaussians")
     focus = np.array(visit.page.evaluate("view.focus"))
     assert focus == pytest.approx(np.median(points, axis=0), abs=0.02)
-    pose = np.array(seen["camera_to_world"])
+    pose = np.array(view["camera_to_world"])
     assert pose[1, 1] > 0.9, "y points down"
     away = np.linalg.norm(pose[:3, 3] - focus)
     distances = np.linalg.norm(points - focus, axis=1)
     assert 1.2 * np.median(distances) < away < 11 * np.median(distances)
-    assert psnr(pixels(visit.page), rendered(service.http, model, seen)) > 25
+    assert psnr(pixels(visit.page), rendered(service.http, model, view)) > 25
 
 
 def test_cameras_are_drawn_and_can_be_chosen(shown: Page) -> None:
@@ -429,8 +429,8 @@ def test_without_webgl_the_server_renders_pictures(service: Up, model: SmallMode
     assert "no WebGL" in page.evaluate("view.whyNot")
 
     def rested() -> None:
-        wanted = page.evaluate("view.surface.query(view.surface.wanted, 1280)")
-        page.wait_for_function("(wanted) => view.canvas.dataset.shown === wanted", arg=wanted, polling=100)
+        query = page.evaluate("view.surface.query(view.surface.wanted, 1280)")
+        page.wait_for_function("(query) => view.canvas.dataset.shown === query", arg=query, polling=100)
 
     rested()
     assert psnr(pixels(page), rendered(service.http, model, camera(page))) > 30

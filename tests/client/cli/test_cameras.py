@@ -45,21 +45,21 @@ def files_under(folder: Path) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    ("chosen", "wanted"),
+    ("chosen", "names"),
     [
         ("colmap", ["sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/points3D.bin"]),
         ("transforms", ["points3D.ply", "transforms.json"]),
     ],
 )
-def test_a_folder_gives_one_format(tmp_path: Path, chosen: str, wanted: list[str]) -> None:
+def test_a_folder_gives_one_format(tmp_path: Path, chosen: str, names: list[str]) -> None:
     (tmp_path / "model").mkdir()
     (tmp_path / "model/cameras.zip").write_bytes(FULL)
-    for given in ("model", "model/model.ply"):
-        out = tmp_path / f"out-{Path(given).name}"
-        done = invoke("cameras", tmp_path / given, "-o", out, "--format", chosen)
+    for model in ("model", "model/model.ply"):
+        out = tmp_path / f"out-{Path(model).name}"
+        done = invoke("cameras", tmp_path / model, "-o", out, "--format", chosen)
         assert done.exit_code == 0, done.output
-        assert files_under(out) == wanted
-        assert sorted(done.output.split()) == sorted(str(out / name) for name in wanted)
+        assert files_under(out) == names
+        assert sorted(done.output.split()) == sorted(str(out / name) for name in names)
 
 
 def test_a_model_on_a_server(service: Service, tmp_path: Path) -> None:

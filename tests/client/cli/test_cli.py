@@ -320,18 +320,18 @@ def test_a_second_interruption_does_not_wait(peer, reply, photos: Path, tmp_path
     capture = {"id": "c1", "created_at": "2026-01-01T00:00:00Z"}
     file = {"role": "images", "name": "a.jpg", "size": 1, "sha256": "0" * 64}
 
-    async def answer(seen):
-        if seen.path.endswith(("/events", "/cancel")):
+    async def answer(request):
+        if request.path.endswith(("/events", "/cancel")):
             await asyncio.Event().wait()  # a server that hangs
-        body = file if seen.method == "PUT" else capture if seen.path.endswith("/captures") else job
+        body = file if request.method == "PUT" else capture if request.path.endswith("/captures") else job
         return reply(status=201, body=json.dumps(body).encode())
 
     peer.answer = answer
     process = spawn("train", photos, "-o", tmp_path / "out", "--server", peer.url)
-    wait_for(lambda: any(seen.path.endswith("/events") for seen in peer.seen))
+    wait_for(lambda: any(request.path.endswith("/events") for request in peer.requests))
     process.send_signal(signal.SIGINT)
     process.send_signal(signal.SIGTERM)  # timeout(1) signals the process and its group
-    wait_for(lambda: any(seen.path.endswith("/cancel") for seen in peer.seen))
+    wait_for(lambda: any(request.path.endswith("/cancel") for request in peer.requests))
     assert process.poll() is None
     time.sleep(2 * ONE_SIGNAL_SECONDS)
     process.send_signal(signal.SIGINT)
@@ -347,7 +347,7 @@ def test_an_interruption_before_the_job_began(peer, reply, photos: Path, tmp_pat
 
     peer.answer = hang
     process = spawn("train", photos, "-o", tmp_path / "out", "--server", peer.url)
-    wait_for(lambda: peer.seen)
+    wait_for(lambda: peer.requests)
     process.send_signal(signal.SIGINT)
     _, stderr = process.communicate(timeout=30)
     assert (process.returncode, stderr) == (Exit.cancelled, "Stopped.\n")

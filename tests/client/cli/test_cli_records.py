@@ -226,8 +226,8 @@ def test_tags_and_stars_are_given_and_lists_are_narrowed_by_them(at, jobs):
         printed = invoke(command, "--json", *options, *at).stdout
         return [json.loads(line)["id"] for line in printed.splitlines()]
 
-    given = invoke("label", jobs[0], "--tags", " Garden , drone,", "--favourite", *at)
-    assert given.stdout == f"The job {jobs[0]} is tagged Garden, drone, with a star.\n"
+    result = invoke("label", jobs[0], "--tags", " Garden , drone,", "--favourite", *at)
+    assert result.stdout == f"The job {jobs[0]} is tagged Garden, drone, with a star.\n"
     assert invoke("label", jobs[1], "--tags", "drone", *at).stdout == f"The job {jobs[1]} is tagged drone.\n"
     assert listed("jobs", "--tag", "DRONE") == jobs[1::-1]
     assert listed("jobs", "--tag", "garden") == listed("jobs", "--favourite") == [jobs[0]]

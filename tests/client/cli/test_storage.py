@@ -31,9 +31,9 @@ def test_the_sdk_returns_the_use_of_storage(service: Service, tmp_path) -> None:
     capture = _upload(service, tmp_path)
     with Client(service.url) as client:
         use = client.storage(largest=1)
-    assert [found.owner for found in use.owners] == ["default"]
+    assert [owner.owner for owner in use.owners] == ["default"]
     assert use.owners[0].bytes == use.owners[0].by_kind.total > 10_000
-    assert [(found.kind.value, found.id, found.name) for found in use.largest] == [
+    assert [(record.kind.value, record.id, record.name) for record in use.largest] == [
         ("capture", capture, "garden")
     ]
 
@@ -52,9 +52,9 @@ def test_the_command_prints_owners_and_the_largest_records(service: Service, tmp
     lines = [line.split() for line in shown.output.splitlines()]
     assert lines[0] == ["owner", "total", "captures", "cameras", "jobs", "models", "uploads", "limit"]
     assert lines[1][:3] == ["default", "10.3", "kB"]
-    found = next(line for line in lines if capture in line)
-    assert found[:4] == [capture, "garden", "capture", "default"]
-    assert found[-2:] == ["on", "request"]
+    row = next(line for line in lines if capture in line)
+    assert row[:4] == [capture, "garden", "capture", "default"]
+    assert row[-2:] == ["on", "request"]
     assert "The next sweep deletes nothing." in shown.output
     as_json = CliRunner().invoke(app, ["storage", "--server", service.url, "--json"], env=WIDE)
     assert json.loads(as_json.output)["largest"][0]["id"] == capture
@@ -95,7 +95,7 @@ def test_planned_deletions_and_expiries_are_shown_with_whole_ids(peer, reply) ->
     peer.answer = lambda _: reply(body=json.dumps(use).encode())
     shown = CliRunner().invoke(app, ["storage", "--server", peer.url, "--owner", "lab", "-n", "2"])
     assert shown.exit_code == 0, shown.output
-    assert peer.seen[0].path == "/v1/storage?largest=2&owner=lab"
+    assert peer.requests[0].path == "/v1/storage?largest=2&owner=lab"
     lines = [" ".join(line.split()) for line in shown.output.splitlines()]
     assert "lab 3.0 MB 0 B 0 B 0 B 0 B 0 B 5.0 MB" in lines
     assert "(nobody) 7 B 0 B 0 B 0 B 0 B 0 B none" in lines

@@ -251,5 +251,5 @@ def test_a_real_training_goes_on_at_its_checkpoint_with_its_cameras(tmp_path: Pa
 
 def _step(line: str) -> int:
     """The step in a line of progress, or 0."""
-    found = re.match(r"training  (\d+)/", line)
-    return int(found[1]) if found else 0
+    match = re.match(r"training  (\d+)/", line)
+    return int(match[1]) if match else 0

@@ -142,9 +142,9 @@ def test_looking_at_puts_the_target_in_the_middle(eye: tuple[float, ...], target
     if distance < 1e-2 or abs(direction[2]) > 0.999 * distance:
         return
     camera = CameraSpec.looking_at(eye, target, width=64, height=48)
-    seen = np.array(camera.viewmat()) @ [*target, 1.0]
-    np.testing.assert_allclose(seen[:2], 0, atol=1e-9 * max(1, distance))
-    assert seen[2] == pytest.approx(distance)
+    point = np.array(camera.viewmat()) @ [*target, 1.0]
+    np.testing.assert_allclose(point[:2], 0, atol=1e-9 * max(1, distance))
+    assert point[2] == pytest.approx(distance)
     # The world's up points up in the picture, whose y axis points down.
     assert np.array(camera.viewmat())[1, 2] < 0
 

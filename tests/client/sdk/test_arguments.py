@@ -32,8 +32,8 @@ def test_a_misspelt_argument_is_found_by_the_type_checker_and_refused(tmp_path: 
 
 
 def test_what_the_types_permit_is_accepted() -> None:
-    given: TrainArguments = {"time_budget": "5m", "max_memory": "2GiB", "preset": "draft", "seed": 3}
-    options = TrainOptions.model_validate(given)
+    keywords: TrainArguments = {"time_budget": "5m", "max_memory": "2GiB", "preset": "draft", "seed": 3}
+    options = TrainOptions.model_validate(keywords)
     assert (options.time_budget, options.max_memory, options.preset) == (300, 2 << 30, "draft")
     with pytest.raises(ValidationError):
         TrainOptions.model_validate({"preset": "best"})

@@ -21,7 +21,7 @@ DATA = b"\xff\xd8\xff a photo" * 1000
 @pytest.fixture
 def settings(redis_url, tmp_path, peer, reply):
     """Those of the other tests, with leave to fetch from `peer`."""
-    peer.answer = lambda seen: reply(body=DATA) if "photo" in seen.path else reply(status=404)
+    peer.answer = lambda request: reply(body=DATA) if "photo" in request.path else reply(status=404)
     allow = peer.url.removeprefix("http://")
     return Settings(redis_url=redis_url, data=tmp_path / "data", outgoing_allow=allow)
 
@@ -37,7 +37,7 @@ def test_a_file_is_fetched_into_a_capture(service, peer):
         assert (heard[-1].done, heard[-1].total) == (len(DATA), len(DATA))
         more = client.imports.start(f"{peer.url}/photo", capture=begun.capture, role="masks", name="a.png")
         assert client.imports.wait(begun.capture, more.id).state is ImportState.succeeded
-        assert [found.id for found in client.imports.list(begun.capture)] == [more.id, begun.id]
+        assert [entry.id for entry in client.imports.list(begun.capture)] == [more.id, begun.id]
         capture = client.capture(begun.capture)
         assert capture.name == "photo%201.jpg"
         assert sorted(file.name for file in capture.files) == ["a.png", "photo 1.jpg"]
@@ -53,7 +53,7 @@ def test_a_file_is_fetched_into_a_capture(service, peer):
             client.imports.start("http://10.0.0.1/a.jpg")
         with pytest.raises(InvalidRequest, match="sha256"):
             client.imports.start(f"{peer.url}/photo", sha256="short")
-        assert [found.id for found in client.captures()] == [begun.capture]
+        assert [entry.id for entry in client.captures()] == [begun.capture]
 
 
 def test_the_command(service, peer):

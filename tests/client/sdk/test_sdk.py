@@ -206,8 +206,8 @@ def test_lists_can_be_narrowed(service, photos):
         service.begin(other.id)
         service.finish(other.id, PLY)
 
-        def jobs(**wanted) -> list[str]:
-            return [job.id for job in client.jobs(**wanted)]
+        def jobs(**filters) -> list[str]:
+            return [job.id for job in client.jobs(**filters)]
 
         assert jobs(name="KITCHEN") == made[::-1]
         assert jobs(name="garden") == [other.id]
@@ -218,10 +218,10 @@ def test_lists_can_be_narrowed(service, photos):
         assert jobs(name="no such") == []
         with pytest.raises(InvalidRequest, match="state"):
             jobs(state="sleeping")
-        assert [found.id for found in client.captures()] == [garden.id, kitchen.id]
-        assert [found.id for found in client.captures(limit=1)] == [garden.id]
-        assert [found.id for found in client.captures(name="2ND")] == [kitchen.id]
-        assert [found.id for found in client.models(name="gard")] == [other.id]
+        assert [capture.id for capture in client.captures()] == [garden.id, kitchen.id]
+        assert [capture.id for capture in client.captures(limit=1)] == [garden.id]
+        assert [capture.id for capture in client.captures(name="2ND")] == [kitchen.id]
+        assert [model.id for model in client.models(name="gard")] == [other.id]
         assert list(client.models(name="kitchen")) == []
 
 
@@ -255,13 +255,13 @@ def test_what_is_in_the_bin_can_be_restored(service, photos):
         assert {entry.id for entry in client.bin.list()} == {job.id, job.job.capture}
         client.bin.restore_job(job.id)
         client.bin.restore_capture(job.job.capture)
-        assert [found.id for found in client.models()] == [model.id]
+        assert [entry.id for entry in client.models()] == [model.id]
         with pytest.raises(NotFound):
             client.bin.restore_job(job.id)
         assert model.rename(None).name is None
         assert model.label(tags=["garden", "Garden"]).tags == job.label(favourite=True).tags == ["garden"]
-        assert [found.id for found in client.models(tag="GARDEN", favourite=True, sort="name")] == [model.id]
-        assert [found.id for found in client.jobs(tag="garden", favourite=False)] == []
+        assert [entry.id for entry in client.models(tag="GARDEN", favourite=True, sort="name")] == [model.id]
+        assert [entry.id for entry in client.jobs(tag="garden", favourite=False)] == []
         with pytest.raises(InvalidRequest):
             model.label(tags=["a,b"])
 
@@ -308,9 +308,9 @@ def test_what_the_server_says_of_itself(service):
 
 def test_an_estimate_is_a_question(service):
     with Client(service.url) as client:
-        found = client.estimate(24, TrainOptions(time_budget=90), posed=True)
-        assert [stage.seconds for stage in found.stages] == [None, 90.0, None]
-        assert found.seconds is None
+        estimate = client.estimate(24, TrainOptions(time_budget=90), posed=True)
+        assert [stage.seconds for stage in estimate.stages] == [None, 90.0, None]
+        assert estimate.seconds is None
         assert list(client.jobs()) == []
 
 

@@ -30,7 +30,7 @@ def test_the_life_of_a_link(url):
         assert (made.model, made.name, made.active) == (MODEL, "for mum", True)
         assert (made.expires_at - made.created_at).total_seconds() == 7200
         assert httpx.get(f"{url.rstrip('/')}{made.path}/model", timeout=60).json()["id"] == MODEL
-        assert [found.id for found in shares.list()] == [made.id]
+        assert [share.id for share in shares.list()] == [made.id]
         shares.revoke(made.id)
         [ended] = shares.list()
         assert ended.revoked_at is not None

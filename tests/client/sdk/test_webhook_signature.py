@@ -17,8 +17,8 @@ SIGNATURE = "v1,g0hM9SsE+OTPJTGt/tmIKtSyZlE3uFJELVlNIOLJ1OE="
 
 
 def headers(**other: str) -> dict[str, str]:
-    found = {"Webhook-Id": MESSAGE, "Webhook-Timestamp": str(TIME), "Webhook-Signature": SIGNATURE}
-    return found | {f"Webhook-{name.capitalize()}": value for name, value in other.items()}
+    standard = {"Webhook-Id": MESSAGE, "Webhook-Timestamp": str(TIME), "Webhook-Signature": SIGNATURE}
+    return standard | {f"Webhook-{name.capitalize()}": value for name, value in other.items()}
 
 
 def test_the_signature_is_that_of_the_specification() -> None:

@@ -52,7 +52,9 @@ def test_the_life_of_a_webhook(service, peer, tmp_path):
         delivery = delivered(client, made.id)
         assert (delivery.job, delivery.event) == (job_id, WebhookEvent.failed)
         assert delivery.attempts[0].status == 200
-        payload = verify_webhook(peer.seen[0].headers, peer.seen[0].body, [made.secret, rotated.secret])
+        payload = verify_webhook(
+            peer.requests[0].headers, peer.requests[0].body, [made.secret, rotated.secret]
+        )
         assert payload["data"]["id"] == job_id
         assert client.webhooks.repeat(made.id, delivery.id).state == "pending"
         wait_for(lambda: len(delivered(client, made.id).attempts) == 2)

@@ -40,7 +40,7 @@ def test_reading_is_tried_again(peer, reply, trouble):
     peer.script(reply(**trouble), reply(**trouble), reply(body=JOB_BYTES))
     with Client(peer.url) as client:
         assert client.job("j1").id == "j1"
-    assert len(peer.seen) == 3
+    assert len(peer.requests) == 3
 
 
 def test_plain_http_reads_no_certificates(peer, reply, monkeypatch):
@@ -57,7 +57,7 @@ def test_it_gives_up_with_the_last_reason(peer, reply):
     with Client(peer.url, retries=2) as client, pytest.raises(Unavailable) as error:
         client.job("j1")
     assert error.value.code == "queue_unavailable"
-    assert len(peer.seen) == 3
+    assert len(peer.requests) == 3
 
 
 def test_a_request_that_was_not_handled_is_sent_again_when_the_server_says_so(peer, reply, tmp_path):
@@ -69,7 +69,7 @@ def test_a_request_that_was_not_handled_is_sent_again_when_the_server_says_so(pe
     peer.script(reply(**busy), reply(status=201, body=capture), reply(status=201, body=file))
     with Client(peer.url) as client:
         assert client.upload(tmp_path)[0].id == "c1"
-    assert [seen.method for seen in peer.seen] == ["POST", "POST", "PUT"]
+    assert [request.method for request in peer.requests] == ["POST", "POST", "PUT"]
 
 
 def test_a_limit_that_no_time_lifts_is_told_at_once(peer, reply):
@@ -77,7 +77,7 @@ def test_a_limit_that_no_time_lifts_is_told_at_once(peer, reply):
     with Client(peer.url) as client, pytest.raises(TooManyRequests) as error:
         client.submit("c1")
     assert error.value.retry_after is None
-    assert len(peer.seen) == 1
+    assert len(peer.requests) == 1
 
 
 def test_a_long_time_to_wait_is_told_and_not_slept_through(peer, reply):
@@ -87,7 +87,7 @@ def test_a_long_time_to_wait_is_told_and_not_slept_through(peer, reply):
     with Client(peer.url) as client, pytest.raises(TooManyRequests) as error:
         client.job("j1")
     assert error.value.retry_after == 3600
-    assert len(peer.seen) == 1
+    assert len(peer.requests) == 1
 
 
 @pytest.mark.parametrize(
@@ -110,19 +110,19 @@ def test_creating_a_capture_is_sent_once(peer, reply, tmp_path):
     peer.answer = lambda _: reply(dropped=True)
     with Client(peer.url) as client, pytest.raises(ConnectionFailed, match="was lost"):
         client.upload(tmp_path)
-    assert len(peer.seen) == 1
+    assert len(peer.requests) == 1
 
 
 def test_creating_a_job_is_repeated_under_one_key(peer, reply):
     peer.script(reply(dropped=True), reply(status=503), reply(status=202, body=JOB_BYTES))
     with Client(peer.url) as client:
         client.submit("c1")
-        keys = {seen.headers[IDEMPOTENCY_HEADER.lower()] for seen in peer.seen}
+        keys = {request.headers[IDEMPOTENCY_HEADER.lower()] for request in peer.requests}
         peer.script(reply(status=202, body=JOB_BYTES))
         client.submit("c1")
-    assert len(peer.seen) == 4
+    assert len(peer.requests) == 4
     assert len(keys) == 1
-    assert peer.seen[-1].headers[IDEMPOTENCY_HEADER.lower()] not in keys, "another job needs another key"
+    assert peer.requests[-1].headers[IDEMPOTENCY_HEADER.lower()] not in keys, "another job needs another key"
 
 
 @pytest.mark.parametrize("status", [400, 404, 409, 422, 500, 507])
@@ -134,7 +134,7 @@ def test_a_refusal_that_waiting_does_not_mend_is_final(peer, reply, status):
     ):
         client.job("j1")
     assert error.value.problem.status == status
-    assert len(peer.seen) == 1
+    assert len(peer.requests) == 1
 
 
 def test_a_problem_arrives_whole(peer, reply):
@@ -185,12 +185,12 @@ def test_the_key_travels_in_a_header_only(peer, reply, monkeypatch):
         client.job("j1")
     with Client(api_key="") as client:
         client.job("j1")
-    assert [seen.headers.get("authorization") for seen in peer.seen] == [
+    assert [request.headers.get("authorization") for request in peer.requests] == [
         "Bearer s3cret",
         "Bearer from-env",
         None,
     ]
-    assert not any("s3cret" in seen.path or "from-env" in seen.path for seen in peer.seen)
+    assert not any("s3cret" in request.path or "from-env" in request.path for request in peer.requests)
 
 
 @pytest.mark.parametrize(

@@ -30,8 +30,8 @@ def tree(root: Path, *names: str) -> Path:
 
 
 def roles(path: Path) -> dict[Role, list[str]]:
-    found = find_files(path)
-    return {role: [file.name for file in found.files if file.role is role] for role in Role}
+    capture_files = find_files(path)
+    return {role: [file.name for file in capture_files.files if file.role is role] for role in Role}
 
 
 def test_a_folder_of_photos(tmp_path: Path):
@@ -50,9 +50,9 @@ def test_a_folder_of_photos(tmp_path: Path):
         Role.masks: [],
         Role.poses: [],
     }
-    found = find_files(tmp_path)
-    assert found.ignored == ("notes.txt",)
-    assert found.bytes == 30
+    capture_files = find_files(tmp_path)
+    assert capture_files.ignored == ("notes.txt",)
+    assert capture_files.bytes == 30
 
 
 @pytest.mark.parametrize(
@@ -102,9 +102,9 @@ def test_masks_lie_beside_photos(tmp_path: Path):
         "masks/left/b.png",
         "masks/readme.txt",
     )
-    found = roles(tmp_path)
-    assert found[Role.images] == ["a.jpg", "left/b.jpg"]
-    assert found[Role.masks] == ["a.jpg.png", "left/b.png"]
+    names = roles(tmp_path)
+    assert names[Role.images] == ["a.jpg", "left/b.jpg"]
+    assert names[Role.masks] == ["a.jpg.png", "left/b.png"]
 
 
 def test_a_colmap_model_is_found_where_tools_put_it(tmp_path: Path):
@@ -136,9 +136,9 @@ def test_all_models_of_a_mapper_are_sent_because_the_largest_is_chosen_by_its_ph
     model = ("cameras.bin", "images.bin")
     tree(tmp_path, "images/a.jpg", *(f"sparse/{k}/{name}" for k in (0, 2, 10) for name in model))
     assert roles(tmp_path)[Role.poses] == [f"sparse/{k}/{name}" for k in (0, 10, 2) for name in model]
-    found = find_cameras(walk(tmp_path))
-    assert found is not None
-    assert found.models == ("sparse/0/", "sparse/2/", "sparse/10/")
+    cameras = find_cameras(walk(tmp_path))
+    assert cameras is not None
+    assert cameras.models == ("sparse/0/", "sparse/2/", "sparse/10/")
 
 
 MODEL = ("sparse/0/cameras.bin", "sparse/0/images.bin")
@@ -165,10 +165,13 @@ NESTED = {
 def test_a_data_set_some_folders_down_is_found(tmp_path: Path, kind: str):
     top, photos, poses = NESTED[kind]
     tree(tmp_path, f"{photos}a.jpg", f"{photos}b.jpg", *poses)
-    found = find_files(tmp_path)
-    assert found.top == top
-    assert [Path(file.name).name for file in found.files if file.role is Role.images] == ["a.jpg", "b.jpg"]
-    sent = [file.name for file in found.files if file.role is Role.poses]
+    capture_files = find_files(tmp_path)
+    assert capture_files.top == top
+    assert [Path(file.name).name for file in capture_files.files if file.role is Role.images] == [
+        "a.jpg",
+        "b.jpg",
+    ]
+    sent = [file.name for file in capture_files.files if file.role is Role.poses]
     assert len(sent) == len([name for name in poses if name != "readme.txt"])
     assert all(f"{top}{name}" in poses for name in sent)
 
@@ -189,8 +192,8 @@ def test_two_data_sets_side_by_side_are_refused_with_both_named(tmp_path: Path):
     ],
 )
 def test_files_that_are_no_second_data_set(names: list[str], top: str | None):
-    found = find_cameras(names)
-    assert (found.top if found is not None else None) == top
+    cameras = find_cameras(names)
+    assert (cameras.top if cameras is not None else None) == top
 
 
 @pytest.mark.parametrize("name", ["walk.MOV", "photos.zip", "one.jpg"])
@@ -280,8 +283,8 @@ def test_photos_beside_the_folder_images_are_used_where_cameras_name_them(
 ):
     tree(tmp_path, "images/a.jpg", "more/b.jpg", "images_4/a.jpg")
     (tmp_path / "transforms.json").write_text(f'{{"frames": [{{"file_path": "./{named}"}}]}}')
-    found = roles(tmp_path)[Role.images]
-    assert [name for name in found if not name.startswith("images_4")] == photos
+    names = roles(tmp_path)[Role.images]
+    assert [name for name in names if not name.startswith("images_4")] == photos
 
 
 def test_a_folder_of_results_alone_is_called_that(tmp_path: Path):
@@ -371,22 +374,22 @@ def test_one_bad_name_is_changed_and_the_others_stay(tmp_path: Path, bad: bytes,
     path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/" + bad))
     path.parent.mkdir(exist_ok=True)
     path.write_bytes(b"x")
-    found = find_files(tmp_path)
-    names = {file.path: file.name for file in found.files}
+    capture_files = find_files(tmp_path)
+    names = {file.path: file.name for file in capture_files.files}
     assert len(names) == 31
     stored = names[path]
     assert re.fullmatch(rf"{stem}-[0-9a-f]{{8}}(/1)?\.jpg", stored)
     assert safe_name(stored) == stored
-    assert found.renamed == ((os.fsdecode(bad), stored),)
-    assert found.left_out == ()
+    assert capture_files.renamed == ((os.fsdecode(bad), stored),)
+    assert capture_files.left_out == ()
     assert set(names.values()) == {f"{number}.jpg" for number in range(30)} | {stored}
     assert printable(os.fsdecode(bad)).encode()  # no terminal or JSON fails on it
 
 
 def test_a_photo_and_its_mask_are_renamed_alike_and_no_name_is_taken(tmp_path: Path) -> None:
     tree(tmp_path, "images/x:1.jpg", "images/x_1.jpg", "images/y:1.jpg", "masks/x:1.png")
-    found = find_files(tmp_path)
-    names = {(file.role, file.path.name): file.name for file in found.files}
+    capture_files = find_files(tmp_path)
+    names = {(file.role, file.path.name): file.name for file in capture_files.files}
     assert len(set(names.values())) == 4
     photos = [name for (role, _), name in names.items() if role is Role.images]
     assert paired(photos, [names[Role.masks, "x:1.png"]]) == {
@@ -403,10 +406,10 @@ def test_photos_with_rare_suffixes(tmp_path: Path) -> None:
 def test_results_among_the_photos_are_no_photos(tmp_path: Path) -> None:
     results = [f"out/{name}" for name in (*FILES, *OPTIONAL_FILES, "novel_view.png", "orbit.mp4")]
     tree(tmp_path, "1.jpg", "2.jpg", "preview.jpg", "out/mine.jpg", *results)
-    found = find_files(tmp_path)
+    capture_files = find_files(tmp_path)
     # Of a picture that somebody put there, and of a preview that was copied, nothing says that it is a result.
-    assert [file.name for file in found.files] == ["1.jpg", "2.jpg", "out/mine.jpg", "preview.jpg"]
-    assert found.outputs == tuple(sorted(f"out/{name}" for name in OUTPUT_MEDIA))
+    assert [file.name for file in capture_files.files] == ["1.jpg", "2.jpg", "out/mine.jpg", "preview.jpg"]
+    assert capture_files.outputs == tuple(sorted(f"out/{name}" for name in OUTPUT_MEDIA))
 
 
 def test_results_beside_the_photos_and_after_an_interruption(tmp_path: Path) -> None:
@@ -429,9 +432,9 @@ def test_pictures_beside_the_report_of_another_program_are_photos(tmp_path: Path
 def test_a_name_that_cannot_be_changed_is_left_out(tmp_path: Path) -> None:
     deep = "/".join(["a"] * 17)
     tree(tmp_path, "1.jpg", f"{deep}.jpg")
-    found = find_files(tmp_path)
-    assert [file.name for file in found.files] == ["1.jpg"]
-    [(name, reason)] = found.left_out
+    capture_files = find_files(tmp_path)
+    assert [file.name for file in capture_files.files] == ["1.jpg"]
+    [(name, reason)] = capture_files.left_out
     assert name == f"{deep}.jpg"
     assert "17 parts" in reason
     (tmp_path / "1.jpg").unlink()
@@ -460,11 +463,11 @@ def test_what_is_no_regular_file_is_left_out_by_name(tmp_path: Path, name: str) 
     make(tmp_path / name)
     (tmp_path / "loop").symlink_to(tmp_path)
     (tmp_path / "a_link").symlink_to(tmp_path / "x.jpg")
-    found = find_files(tmp_path)
-    assert [(file.role, file.name) for file in found.files] == [
+    capture_files = find_files(tmp_path)
+    assert [(file.role, file.name) for file in capture_files.files] == [
         (Role.images, each) for each in ("a.jpg", "b.jpg", "x.jpg/c.jpg")
     ]
-    assert [each for each in found.remarks if each.startswith("Left out")] == [
+    assert [each for each in capture_files.remarks if each.startswith("Left out")] == [
         f"Left out are {name}: it is {reason}{', not a file' if 'pipe' in reason else ''}."
     ]
     for path in ("a.jpg", "b.jpg", "x.jpg/c.jpg"):
@@ -519,10 +522,10 @@ def test_the_shared_data_sets():
 
 
 @pytest.mark.parametrize(
-    "given",
+    "part",
     ["transforms.json", "database.db", "sparse", "sparse/0", "sparse/0/cameras.txt", "sparse/0/points3D.txt"],
 )
-def test_a_part_of_a_data_set_stands_for_the_whole(tmp_path: Path, given: str) -> None:
+def test_a_part_of_a_data_set_stands_for_the_whole(tmp_path: Path, part: str) -> None:
     whole = tree(
         tmp_path / "2024",
         "images/a.jpg",
@@ -531,9 +534,9 @@ def test_a_part_of_a_data_set_stands_for_the_whole(tmp_path: Path, given: str) -
         "sparse/0/points3D.txt",
     )
     tree(whole, "transforms.json", "database.db")
-    found = find_files(whole / given)
-    assert found.contents() == ["1 photo", "4 pose files"]
-    assert str(whole) in found.remarks[0]
+    capture_files = find_files(whole / part)
+    assert capture_files.contents() == ["1 photo", "4 pose files"]
+    assert str(whole) in capture_files.remarks[0]
     assert find_files(whole).remarks == ()
 
 

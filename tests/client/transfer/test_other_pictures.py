@@ -53,17 +53,17 @@ def test_maps_beside_photos_are_no_photos(tmp_path: Path) -> None:
         "masks/0.png",
         "thumbs/0.jpg",
     )
-    found = find_files(tmp_path)
-    assert {(file.role, file.name) for file in found.files} == {
+    capture_files = find_files(tmp_path)
+    assert {(file.role, file.name) for file in capture_files.files} == {
         (Role.images, "rgb/0.jpg"),
         (Role.images, "thumbs/0.jpg"),
         (Role.masks, "0.png"),
         (Role.poses, "depth/0.png"),
         (Role.poses, "confidence/0.png"),
     }
-    assert found.contents() == ["2 photos", "1 mask", "2 depth or confidence maps"]
-    assert found.ignored == ("Normals/0.png",)
-    assert found.remarks == (
+    assert capture_files.contents() == ["2 photos", "1 mask", "2 depth or confidence maps"]
+    assert capture_files.ignored == ("Normals/0.png",)
+    assert capture_files.remarks == (
         "1 picture is taken for normal maps by the name of the folder and not used: Normals/0.png.",
     )
 
@@ -78,13 +78,15 @@ def test_depth_maps_of_a_data_set_go_along_by_their_folder_or_by_their_frames(tm
 
 def test_depth_maps_go_along_with_a_video(tmp_path: Path) -> None:
     tree(tmp_path, "rgb.mp4", "depth/000000.png", "confidence/000000.png", "odometry.csv")
-    found = find_files(tmp_path)
-    assert [file.name for file in found.files if file.role is Role.images] == ["rgb.mp4"]
-    assert {file.name for file in found.files if file.role is Role.poses} >= {
+    capture_files = find_files(tmp_path)
+    assert [file.name for file in capture_files.files if file.role is Role.images] == ["rgb.mp4"]
+    assert {file.name for file in capture_files.files if file.role is Role.poses} >= {
         "depth/000000.png",
         "confidence/000000.png",
     }
-    assert any("The cameras of Stray Scanner in odometry.csv are not read" in each for each in found.remarks)
+    assert any(
+        "The cameras of Stray Scanner in odometry.csv are not read" in each for each in capture_files.remarks
+    )
 
 
 @pytest.mark.parametrize(

@@ -66,8 +66,8 @@ def test_a_profile_is_an_address_a_key_certificates_and_a_proxy(lab: Path):
 
 def test_arguments_come_before_the_environment_and_that_before_a_profile_it_names(lab: Path, monkeypatch):
     def chosen(*arguments, **options) -> tuple[str, str | None]:
-        found = choose_server(*arguments, **options)
-        return found.server, found.api_key
+        choice = choose_server(*arguments, **options)
+        return choice.server, choice.api_key
 
     assert chosen(None) == ("http://127.0.0.1:8080", None)
     monkeypatch.setenv("SPLATMILL_PROFILE", "lab")
@@ -148,14 +148,14 @@ def test_headers_are_sent_with_every_request(peer, reply):
     peer.answer = lambda _: reply(body=b'{"options": []}')
     with Client(peer.url, headers={"X-Team": "mill"}) as client:
         client.options()
-    assert peer.seen[0].headers["x-team"] == "mill"
+    assert peer.requests[0].headers["x-team"] == "mill"
 
 
 def test_requests_go_through_a_proxy(peer, reply):
     peer.answer = lambda _: reply(body=b'{"options": []}')
     with Client("http://splats.example", proxy=peer.url) as client:
         assert client.options() == []
-    assert peer.seen[0].path == "http://splats.example/v1/options"
+    assert peer.requests[0].path == "http://splats.example/v1/options"
 
 
 class _Options(BaseHTTPRequestHandler):

@@ -82,14 +82,16 @@ def test_a_broken_stream_goes_on_after_the_last_event(peer, reply):
         ]
     )
     states = iter(["training", "training", "succeeded"])
-    peer.answer = lambda seen: (
-        next(streams) if seen.path.endswith("/events") else reply(body=job(next(states)))
+    peer.answer = lambda request: (
+        next(streams) if request.path.endswith("/events") else reply(body=job(next(states)))
     )
     with Client(peer.url) as client:
         handle = client.job("j1")
         records = list(handle.events())
     assert [said(record) for record in records] == ["line 0", "line 1", "line 2", "line 3"]
-    asked = [seen.headers.get("last-event-id") for seen in peer.seen if seen.path.endswith("/events")]
+    asked = [
+        request.headers.get("last-event-id") for request in peer.requests if request.path.endswith("/events")
+    ]
     assert asked == [None, "0-0", "0-0", "0-0", "2-0"]
     assert handle.job.state.final
 
@@ -97,9 +99,9 @@ def test_a_broken_stream_goes_on_after_the_last_event(peer, reply):
 def test_a_part_of_the_service_that_is_down_is_waited_for(peer, reply):
     asked: list[str] = []
 
-    def answer(seen):
-        asked.append(seen.path)
-        if seen.path.endswith("/events"):
+    def answer(request):
+        asked.append(request.path)
+        if request.path.endswith("/events"):
             return reply(body=b": nothing to tell\n\n", headers=SSE)
         if 1 < len(asked) < 8:
             return reply(status=503)
@@ -112,8 +114,8 @@ def test_a_part_of_the_service_that_is_down_is_waited_for(peer, reply):
 
 
 def test_a_job_that_is_gone_ends_the_following(peer, reply):
-    peer.answer = lambda seen: (
-        reply(status=404) if seen.path.endswith("/events") else reply(body=job("queued"))
+    peer.answer = lambda request: (
+        reply(status=404) if request.path.endswith("/events") else reply(body=job("queued"))
     )
     with Client(peer.url) as client, pytest.raises(NotFound):
         list(client.job("j1").events())
@@ -135,14 +137,14 @@ def test_patience_has_an_end(peer, reply, monkeypatch):
 
     with pytest.raises(ConnectionFailed, match="was lost"):
         asyncio.run(run())
-    assert len(peer.seen) > 1
+    assert len(peer.requests) > 1
 
 
 def test_leaving_the_loop_early_closes_the_stream(peer, reply):
     parts = b"".join(message(n, LogEvent(message=str(n))) for n in range(3))
-    peer.answer = lambda seen: (
+    peer.answer = lambda request: (
         reply(body=parts + b" " * 10, cut=0, headers=SSE)
-        if seen.path.endswith("/events")
+        if request.path.endswith("/events")
         else reply(body=job("training"))
     )
     with Client(peer.url) as client:
@@ -198,11 +200,13 @@ def test_an_id_that_no_header_can_hold_is_not_sent_back(peer, reply):
         ]
     )
     states = iter(["training", "succeeded"])
-    peer.answer = lambda seen: (
-        next(streams) if seen.path.endswith("/events") else reply(body=job(next(states)))
+    peer.answer = lambda request: (
+        next(streams) if request.path.endswith("/events") else reply(body=job(next(states)))
     )
     with Client(peer.url) as client:
         records = list(client.job("j1").events())
     assert [said(record) for record in records] == ["line 0", "line 1", "line 2"]
-    asked = [seen.headers.get("last-event-id") for seen in peer.seen if seen.path.endswith("/events")]
+    asked = [
+        request.headers.get("last-event-id") for request in peer.requests if request.path.endswith("/events")
+    ]
     assert asked == [None, "0-0"]

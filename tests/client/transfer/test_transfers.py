@@ -30,13 +30,13 @@ MODEL = json.dumps(
 CAPTURE = json.dumps({"id": "c1", "created_at": "2026-01-01T00:00:00Z"}).encode()
 
 
-def ranged(seen, reply, data=DATA, etag='"v1"', cut=0):
+def ranged(request, reply, data=DATA, etag='"v1"', cut=0):
     """A file as a good server gives it."""
     headers = {"ETag": etag, SHA256_HEADER: hashlib.sha256(data).hexdigest()}
-    wanted = seen.headers.get("range")
-    if wanted is None or seen.headers.get("if-range") != etag:
+    span = request.headers.get("range")
+    if span is None or request.headers.get("if-range") != etag:
         return reply(body=data, headers=headers, cut=cut)
-    start = int(wanted.removeprefix("bytes=").removesuffix("-"))
+    start = int(span.removeprefix("bytes=").removesuffix("-"))
     if start >= len(data):
         return reply(status=416)
     headers["Content-Range"] = f"bytes {start}-{len(data) - 1}/{len(data)}"
@@ -44,15 +44,15 @@ def ranged(seen, reply, data=DATA, etag='"v1"', cut=0):
 
 
 def serve(peer, reply, answer):
-    peer.answer = lambda seen: answer(seen) if "/files/" in seen.path else reply(body=MODEL)
+    peer.answer = lambda request: answer(request) if "/files/" in request.path else reply(body=MODEL)
 
 
 def test_a_download_goes_on_where_it_broke(peer, reply, tmp_path):
     tries = []
 
-    def answer(seen):
-        tries.append(seen.headers.get("range"))
-        return ranged(seen, reply, cut=100_000 if len(tries) < 3 else 0)
+    def answer(request):
+        tries.append(request.headers.get("range"))
+        return ranged(request, reply, cut=100_000 if len(tries) < 3 else 0)
 
     serve(peer, reply, answer)
     heard: list[tuple[int, int | None]] = []
@@ -69,25 +69,25 @@ def test_a_download_goes_on_where_it_broke(peer, reply, tmp_path):
 def test_a_later_call_goes_on_with_what_an_earlier_one_left(peer, reply, tmp_path):
     target = tmp_path / "deep" / "model.ply"
     with Client(peer.url, retries=0) as client:
-        serve(peer, reply, lambda seen: ranged(seen, reply, cut=50_000))
+        serve(peer, reply, lambda request: ranged(request, reply, cut=50_000))
         model = client.model("m1")
         with pytest.raises(ConnectionFailed):
             model.download(target)
         assert not target.exists()
-        serve(peer, reply, lambda seen: ranged(seen, reply))
+        serve(peer, reply, lambda request: ranged(request, reply))
         model.download(target)
     assert target.read_bytes() == DATA
-    assert peer.seen[-1].headers["range"] == "bytes=250000-"
+    assert peer.requests[-1].headers["range"] == "bytes=250000-"
 
 
 def test_another_version_of_the_file_is_begun_anew(peer, reply, tmp_path):
     target = tmp_path / "model.ply"
     other = b"the new one" * 1000
     with Client(peer.url, retries=0) as client:
-        serve(peer, reply, lambda seen: ranged(seen, reply, cut=50_000))
+        serve(peer, reply, lambda request: ranged(request, reply, cut=50_000))
         with pytest.raises(ConnectionFailed):
             client.model("m1").download(target)
-        serve(peer, reply, lambda seen: ranged(seen, reply, other, '"v2"'))
+        serve(peer, reply, lambda request: ranged(request, reply, other, '"v2"'))
         client.model("m1").download(target)
     assert target.read_bytes() == other
 
@@ -95,7 +95,7 @@ def test_another_version_of_the_file_is_begun_anew(peer, reply, tmp_path):
 def test_a_part_that_was_whole_already_does_no_harm(peer, reply, tmp_path):
     (tmp_path / "model.ply.part").write_bytes(DATA)
     (tmp_path / "model.ply.part.etag").write_text('"v1"')
-    serve(peer, reply, lambda seen: ranged(seen, reply))
+    serve(peer, reply, lambda request: ranged(request, reply))
     with Client(peer.url) as client:
         assert client.model("m1").download(tmp_path).read_bytes() == DATA
 
@@ -124,10 +124,10 @@ def photos(folder, count=9):
         (folder / f"photo {n}.jpg").write_bytes(DATA[n * 1000 : n * 2000 + 1000])
 
 
-def stored(seen, reply):
-    digest = hashlib.sha256(seen.body).hexdigest()
-    name = seen.path.rsplit("/", 1)[1].replace("%20", " ")
-    body = {"role": "images", "name": name, "size": len(seen.body), "sha256": digest}
+def stored(request, reply):
+    digest = hashlib.sha256(request.body).hexdigest()
+    name = request.path.rsplit("/", 1)[1].replace("%20", " ")
+    body = {"role": "images", "name": name, "size": len(request.body), "sha256": digest}
     return reply(status=201, body=json.dumps(body).encode())
 
 
@@ -135,13 +135,13 @@ def test_files_arrive_whole_with_their_digest(peer, reply, tmp_path):
     photos(tmp_path)
     lost = set()
 
-    def answer(seen):
-        if seen.method == "POST":
+    def answer(request):
+        if request.method == "POST":
             return reply(status=201, body=CAPTURE)
-        if seen.path not in lost:  # every first try fails, one way or another
-            lost.add(seen.path)
+        if request.path not in lost:  # every first try fails, one way or another
+            lost.add(request.path)
             return reply(dropped=True) if len(lost) % 2 else reply(status=503)
-        return stored(seen, reply)
+        return stored(request, reply)
 
     peer.answer = answer
     heard: list[Progress] = []
@@ -149,9 +149,9 @@ def test_files_arrive_whole_with_their_digest(peer, reply, tmp_path):
         capture, uploaded = client.upload(tmp_path, on_progress=heard.append)
     assert capture.id == "c1"
     assert sorted(file.name for file in uploaded.files) == sorted(path.name for path in tmp_path.iterdir())
-    for seen in peer.seen[1:]:
-        assert seen.headers[SHA256_HEADER.lower()] == hashlib.sha256(seen.body).hexdigest()
-        assert seen.headers["content-type"] == "image/jpeg"
+    for request in peer.requests[1:]:
+        assert request.headers[SHA256_HEADER.lower()] == hashlib.sha256(request.body).hexdigest()
+        assert request.headers["content-type"] == "image/jpeg"
     total = sum(path.stat().st_size for path in tmp_path.iterdir())
     assert [entry.done for entry in heard] == sorted(entry.done for entry in heard)
     assert (heard[-1].done, heard[-1].total) == (total, total)
@@ -160,16 +160,16 @@ def test_files_arrive_whole_with_their_digest(peer, reply, tmp_path):
 def refusing(peer, reply, code, names):
     document = Problem.of(code, "It is not a photo.")
 
-    def answer(seen):
-        if seen.method == "POST":
+    def answer(request):
+        if request.method == "POST":
             return reply(status=201, body=CAPTURE)
-        if any(name in seen.path for name in names):
+        if any(name in request.path for name in names):
             return reply(
                 status=document.status,
                 body=document.model_dump_json().encode(),
                 headers={"Content-Type": "application/problem+json"},
             )
-        return stored(seen, reply)
+        return stored(request, reply)
 
     peer.answer = answer
 
@@ -196,14 +196,14 @@ def test_a_refusal_of_the_whole_ends_the_upload(peer, reply, tmp_path):
     with Client(peer.url) as client, pytest.raises(InvalidRequest) as error:
         client.upload(tmp_path)
     assert error.value.code == "body_too_large"
-    assert len(peer.seen) < 9
+    assert len(peer.requests) < 9
 
 
 def test_options_are_checked_before_anything_is_sent(peer, tmp_path):
     photos(tmp_path, 2)
     with Client(peer.url) as client, pytest.raises(InvalidRequest, match="there is no option 'stepps'"):
         client.train(tmp_path, stepps=3)  # type: ignore[call-arg]  # the error is what is tested
-    assert peer.seen == []
+    assert peer.requests == []
 
 
 def test_a_callback_that_fails_ends_the_upload(peer, reply, tmp_path):
@@ -224,10 +224,14 @@ def test_a_file_that_the_capture_holds_is_not_sent_again(peer, reply, tmp_path):
     files = [held | {"name": paths[0].name, "size": paths[0].stat().st_size}]
     files += [held | {"name": paths[1].name, "size": paths[1].stat().st_size}]  # other bytes under this name
     capture = json.dumps(json.loads(CAPTURE) | {"files": files}).encode()
-    peer.answer = lambda seen: reply(body=capture) if seen.method == "GET" else stored(seen, reply)
+    peer.answer = lambda request: reply(body=capture) if request.method == "GET" else stored(request, reply)
     with Client(peer.url) as client:
         _, uploaded = client.upload(tmp_path, capture="c1")
-    sent = [seen.path.rsplit("/", 1)[-1].replace("%20", " ") for seen in peer.seen if seen.method == "PUT"]
+    sent = [
+        request.path.rsplit("/", 1)[-1].replace("%20", " ")
+        for request in peer.requests
+        if request.method == "PUT"
+    ]
     assert sorted(sent) == [paths[1].name, paths[2].name]
     assert sorted(file.name for file in uploaded.files) == sorted(path.name for path in paths)
 
@@ -235,9 +239,9 @@ def test_a_file_that_the_capture_holds_is_not_sent_again(peer, reply, tmp_path):
 def test_a_slow_rendering_is_not_asked_for_again(peer, reply, tmp_path):
     too_slow = Problem.of("render_timeout", "The renderer did not answer within 120 seconds.")
     headers = {"Content-Type": "application/problem+json"}
-    peer.answer = lambda seen: (
+    peer.answer = lambda request: (
         reply(body=MODEL)
-        if seen.method == "GET"
+        if request.method == "GET"
         else reply(status=504, body=too_slow.model_dump_json().encode(), headers=headers)
     )
     at = {"camera_to_world": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}
@@ -247,25 +251,25 @@ def test_a_slow_rendering_is_not_asked_for_again(peer, reply, tmp_path):
             model.render(at | {"width": 64, "height": 48, "fov_y_deg": 50})
         with pytest.raises(Unavailable, match="120 seconds"):
             model.orbit(tmp_path, keep=False)
-    assert [seen.method for seen in peer.seen] == ["GET", "POST", "POST"]
+    assert [request.method for request in peer.requests] == ["GET", "POST", "POST"]
 
 
 def test_an_orbit_is_waited_for_as_long_as_asked_and_asked_for_once(peer, reply, tmp_path):
-    async def never(seen):
+    async def never(request):
         await asyncio.sleep(60)
 
-    peer.answer = lambda seen: reply(body=MODEL) if seen.method == "GET" else never(seen)
+    peer.answer = lambda request: reply(body=MODEL) if request.method == "GET" else never(request)
     with Client(peer.url) as client, pytest.raises(ConnectionFailed):
         client.model("m1").orbit(tmp_path, timeout=0.3, keep=False)
-    assert [seen.method for seen in peer.seen] == ["GET", "POST"]
+    assert [request.method for request in peer.requests] == ["GET", "POST"]
 
 
 def test_a_version_that_no_header_can_hold_is_not_sent_back(peer, reply, tmp_path):
     tries = []
 
-    def answer(seen):
-        tries.append(seen.headers.get("range"))
-        return ranged(seen, reply, etag='"é"', cut=100_000 if len(tries) < 3 else 0)
+    def answer(request):
+        tries.append(request.headers.get("range"))
+        return ranged(request, reply, etag='"é"', cut=100_000 if len(tries) < 3 else 0)
 
     serve(peer, reply, answer)
     with Client(peer.url) as client:
@@ -278,12 +282,12 @@ def test_an_upload_does_not_go_on_at_another_server(peer, reply, tmp_path, monke
     monkeypatch.setattr(uploads, "PIECE", 1000)
     (tmp_path / "film.mp4").write_bytes(DATA)
 
-    def answer(seen):
-        if seen.method == "PUT":
+    def answer(request):
+        if request.method == "PUT":
             return reply(status=201, headers={"Location": address, "Upload-Offset": "0"})
         return reply(body=CAPTURE)
 
     peer.answer = answer
     with Client(peer.url, retries=0) as client, pytest.raises(ConnectionFailed, match="several requests"):
         client.upload(tmp_path / "film.mp4")
-    assert {seen.method for seen in peer.seen} <= {"GET", "POST", "PUT", "DELETE"}
+    assert {request.method for request in peer.requests} <= {"GET", "POST", "PUT", "DELETE"}

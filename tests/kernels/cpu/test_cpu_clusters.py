@@ -155,7 +155,7 @@ def test_what_was_missed_is_what_dense_adam_does_with_zero_gradients(seed: int, 
                 )
                 reference.adam_(values, zeros, first, second, rates_then, step=missed, beta2=beta2)
                 way += (x - unmoved).abs()
-            found = (step.blocks[rows].double(), step.exp_avg[rows].double(), step.exp_avg_sq[rows].double())
+            after = (step.blocks[rows].double(), step.exp_avg[rows].double(), step.exp_avg_sq[rows].double())
             deviation = (v / beta2 ** (number - 1 - last)).sqrt().clamp_min(EPS)
             allowed = (
                 way * (32 * u + 2e-9)
@@ -166,10 +166,10 @@ def test_what_was_missed_is_what_dense_adam_does_with_zero_gradients(seed: int, 
             at_most(
                 "clusters: way",
                 f"{seed} {beta2}",
-                (found[0] - x)[:, moving].abs(),
+                (after[0] - x)[:, moving].abs(),
                 allowed[:, moving] + 1e-30,
             )
-            for name, a, b in (("m", found[1], m), ("v", found[2], v)):
+            for name, a, b in (("m", after[1], m), ("v", after[2], v)):
                 # One power and one product; below the smallest normal number, float32 has 0.
                 at_most(f"clusters: {name}", f"{seed} {beta2}", (a - b).abs(), b.abs() * 4 * u + 2.0**-126)
             returns += 1

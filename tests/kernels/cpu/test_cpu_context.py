@@ -38,9 +38,9 @@ def photo(step: int) -> Tensor:
 
 def train(engine: Step, step: int) -> float:
     """The loss of a step along the street, the middle of which shows both halves."""
-    seen = camera(18.0 + step % 5)
+    view = camera(18.0 + step % 5)
     return engine.train(
-        seen, K, photo(step), degree=3, rates=RATES, step=step + 1, background=BACKGROUND
+        view, K, photo(step), degree=3, rates=RATES, step=step + 1, background=BACKGROUND
     ).loss
 
 
@@ -104,8 +104,8 @@ def test_renderings_have_the_context_and_lists_have_not() -> None:
     engine = Step(*free_of(groups, ~apart), context=named(groups, apart))
     whole = Step(*groups)
     shown, _, _ = engine.forward(camera(20.0), K, WIDTH, HEIGHT, degree=3)
-    wanted, _, _ = whole.forward(camera(20.0), K, WIDTH, HEIGHT, degree=3)
-    torch.testing.assert_close(shown, wanted, rtol=1e-5, atol=1e-6)
+    expected, _, _ = whole.forward(camera(20.0), K, WIDTH, HEIGHT, degree=3)
+    torch.testing.assert_close(shown, expected, rtol=1e-5, atol=1e-6)
     assert engine.count == int((~apart).sum())
     assert [len(moments) for moments in engine.moments()] == [engine.count, engine.count]
     blocks = -(-engine.count // 16)
@@ -160,12 +160,12 @@ def test_a_part_of_a_photo_is_trained_as_the_photo_is(backend: Kernels) -> None:
     whole, part, apart = (open_engine(gaussians, backend) for _ in range(3))
     used = int(mask.sum())
     common: dict[str, Any] = {"degree": 3, "rates": RATES, "step": 1, "background": BACKGROUND}
-    wanted = whole.train_photo(camera(20.0), K, whole_photo, mask=mask, **common)
+    expected = whole.train_photo(camera(20.0), K, whole_photo, mask=mask, **common)
     cut, cut_mask = (each[top:bottom, left:right].contiguous() for each in (whole_photo, mask))
     for engine, counted in ((part, used), (apart, 4 * used)):
         of = PartOf(WIDTH, HEIGHT, counted)
-        seen = engine.train_photo(camera(20.0), shifted, cut, mask=cut_mask, part_of=of, **common)
-    assert seen.loss == pytest.approx(wanted.loss, rel=1e-5)
+        result = engine.train_photo(camera(20.0), shifted, cut, mask=cut_mask, part_of=of, **common)
+    assert result.loss == pytest.approx(expected.loss, rel=1e-5)
     shown = part.visible_count > 0  # outside of the part, the photo shows others
     torch.testing.assert_close(part.plain_sum[shown], whole.plain_sum[shown], rtol=1e-3, atol=1e-8)
     torch.testing.assert_close(part.max_extent[shown], whole.max_extent[shown], rtol=1e-4, atol=1e-6)

@@ -108,11 +108,11 @@ def test_the_loss_falls_along_it_by_its_length() -> None:
 
     def loss_at(h: float) -> tuple[float, Tensor]:
         step = Step(*case.groups())
-        seen = step.train(
+        result = step.train(
             motion(h * direction) @ viewmat, K, photo, degree=3, rates=STILL, step=1, pose_gradient=True
         )
         assert step.pose_gradient is not None
-        return seen.loss, step.pose_gradient
+        return result.loss, step.pose_gradient
 
     direction = torch.zeros(6)
     gradient = loss_at(0.0)[1]

@@ -72,10 +72,10 @@ def fused_gradients(case: Case, step: Step) -> dict[str, Tensor]:
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_coefficients_beyond_the_degree_have_no_gradient(degree: int) -> None:
     case = replace(scene("step", 150), degree=degree)
-    found = fused_gradients(case, make_step(case))["sh"]
+    gradient = fused_gradients(case, make_step(case))["sh"]
     unused = (degree + 1) ** 2
-    assert torch.count_nonzero(found[:, unused:]) == 0
-    assert torch.count_nonzero(found[:, unused - 1]) > 0
+    assert torch.count_nonzero(gradient[:, unused:]) == 0
+    assert torch.count_nonzero(gradient[:, unused - 1]) > 0
 
 
 def test_one_step_is_loss_gradient_and_adam() -> None:
@@ -168,10 +168,10 @@ def test_scores_are_what_they_say() -> None:
 
     projected = case.project(case.groups(torch.float64), case.viewmat.double(), "reference")
     bins = ops.bin(projected, case.width, case.height, backend="reference")
-    seen = torch.isin(torch.arange(24), bins.ids)
-    assert torch.equal(step.visible_count, seen.float())
+    visible = torch.isin(torch.arange(24), bins.ids)
+    assert torch.equal(step.visible_count, visible.float())
     extent = 2 * projected.extents.amax(1) / max(case.width, case.height)
-    torch.testing.assert_close(step.max_extent.double(), torch.where(seen, extent, 0.0), rtol=1e-5, atol=0)
+    torch.testing.assert_close(step.max_extent.double(), torch.where(visible, extent, 0.0), rtol=1e-5, atol=0)
 
 
 def test_scores_that_are_not_asked_for_are_not_kept_and_change_nothing() -> None:
@@ -208,13 +208,13 @@ def test_state_goes_in_and_comes_out_unchanged() -> None:
     assert torch.count_nonzero(step.moments()[0]) == 0
 
 
-@pytest.mark.parametrize(("given", "degree"), [(1, 0), (4, 1), (9, 2)])
-def test_coefficients_that_are_not_given_are_0(given: int, degree: int) -> None:
+@pytest.mark.parametrize(("count", "degree"), [(1, 0), (4, 1), (9, 2)])
+def test_coefficients_that_are_not_given_are_0(count: int, degree: int) -> None:
     case = replace(scene("fewer coefficients", 37), degree=degree)
     *others, sh = case.groups()
-    padded = torch.cat([sh[:, :given], torch.zeros_like(sh[:, given:])], 1)
+    padded = torch.cat([sh[:, :count], torch.zeros_like(sh[:, count:])], 1)
     few, all16 = (
-        case.project([*others, x], case.viewmat, "cpu") for x in (sh[:, :given].contiguous(), padded)
+        case.project([*others, x], case.viewmat, "cpu") for x in (sh[:, :count].contiguous(), padded)
     )
     assert few.colors.any()
     assert torch.equal(few.colors, all16.colors)

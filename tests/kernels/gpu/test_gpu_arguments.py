@@ -50,9 +50,9 @@ def test_launches_pass_the_declared_types(monkeypatch: pytest.MonkeyPatch) -> No
         kernel = kernels[launch.kernel]
         function = kernel.fn if hasattr(kernel, "configs") else kernel
         for name, parameter in inspect.signature(function.fn).parameters.items():
-            if "constexpr" not in str(parameter.annotation) and launch.given[name] is not None:
-                seen, wanted = passed(launch.given[name]), declared(function, name)
-                assert seen == wanted, f"{name} of {launch.kernel}"
+            if "constexpr" not in str(parameter.annotation) and launch.arguments[name] is not None:
+                actual, expected = passed(launch.arguments[name]), declared(function, name)
+                assert actual == expected, f"{name} of {launch.kernel}"
         launched.add(launch.kernel)
 
     kernels = watch(monkeypatch, compare)

@@ -61,10 +61,10 @@ def test_it_runs_dry_and_every_part_leaves_its_rows(tmp_path: Path) -> None:
         assert row.get("ms") is None, "a time of the interpreter says nothing of a GPU"
     assert [row["passed"] for row in rows if row["bench"] == "proofs" and "passed" in row] == [True]
     for name, tile in (("passes", 16), ("tiles", 8)):
-        seen = {row["pass"]: row for row in rows if row["bench"] == name and "pass" in row}
-        assert {row["tile"] for row in seen.values()} == {tile}
-        parts = sum(row["bytes"] for key, row in seen.items() if key not in ("whole step", "rendering"))
-        assert seen["whole step"]["bytes"] == parts
+        passes = {row["pass"]: row for row in rows if row["bench"] == name and "pass" in row}
+        assert {row["tile"] for row in passes.values()} == {tile}
+        parts = sum(row["bytes"] for key, row in passes.items() if key not in ("whole step", "rendering"))
+        assert passes["whole step"]["bytes"] == parts
     assert max(row["largest"] for row in rows if "largest" in row) < 100
     assert "| adam |" in done.stdout
     assert "cut" not in done.stdout

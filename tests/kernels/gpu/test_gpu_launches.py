@@ -95,9 +95,9 @@ def step() -> Step:
 @pytest.fixture
 def kernels(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     """Launches of kernels by name, counted from here on."""
-    found: Counter[str] = Counter()
-    watch(monkeypatch, lambda launch: found.update([launch.kernel]))
-    return found
+    counts: Counter[str] = Counter()
+    watch(monkeypatch, lambda launch: counts.update([launch.kernel]))
+    return counts
 
 
 @pytest.mark.parametrize("mode", MODES)

@@ -91,21 +91,21 @@ def project(
 
 
 def close(
-    name: str, seen: Tensor, plain: Tensor, exact: Tensor, *, slack: float = 8.0, roundings: float = 64
+    name: str, result: Tensor, plain: Tensor, exact: Tensor, *, slack: float = 8.0, roundings: float = 64
 ) -> None:
-    """`seen` is as near to `exact` (float64) as the reference's own arithmetic in float32 (`plain`) is,
+    """`result` is as near to `exact` (float64) as the reference's own arithmetic in float32 (`plain`) is,
     within `slack`.
 
     That is what float32 can give for this scene; a needle may lose all digits and an ordinary splat almost
     none. The floor of some roundings of the largest value covers sums in another order.
     """
     if not exact.numel():
-        assert not seen.numel()
+        assert not result.numel()
         return
-    seen, plain, exact = (x.detach().cpu().double() for x in (seen, plain, exact))
+    result, plain, exact = (x.detach().cpu().double() for x in (result, plain, exact))
     floor = roundings * EPS * float(exact.abs().max())
     allowed = slack * float((plain - exact).abs().max()) + floor
-    error = float((seen - exact).abs().max())
+    error = float((result - exact).abs().max())
     assert error <= allowed, (
         f"{name}: error {error:.3g} where {allowed:.3g} is allowed, largest {exact.abs().max():.3g}"
     )
@@ -117,12 +117,12 @@ def test_project_agrees_with_the_definition(name: str, device: str) -> None:
     case = case_for(name, device, 40)
     exact, _ = project(case, torch.float64, "reference")
     plain, _ = project(case, torch.float32, "reference")
-    seen, _ = project(case, torch.float32, "gpu", device)
-    shown = seen.extents[:, 0].cpu() > 0
+    projected, _ = project(case, torch.float32, "gpu", device)
+    shown = projected.extents[:, 0].cpu() > 0
     # Who is culled may differ only where float32 itself is undecided.
     assert torch.equal(shown, exact.extents[:, 0] > 0) or torch.equal(shown, plain.extents[:, 0] > 0)
     both = shown & (exact.extents[:, 0] > 0) & (plain.extents[:, 0] > 0)
-    for field, a, b, c in zip(Projected._fields, seen, plain, exact, strict=True):
+    for field, a, b, c in zip(Projected._fields, projected, plain, exact, strict=True):
         close(field, a.cpu()[both], b[both], c[both])
         assert not a.cpu()[~shown].any(), f"{field}: a culled row is not zero"
 
@@ -132,7 +132,7 @@ def test_project_agrees_with_the_definition(name: str, device: str) -> None:
 def test_gradient_of_project_agrees_with_the_definition(name: str, device: str) -> None:
     case = case_for(name, device, 40)
     weights: list[Tensor] | None = None
-    found = []
+    gradients = []
     for dtype, backend, where in ways(device):
         fields, leaves = project(case, dtype, backend, where)
         if weights is None:
@@ -143,11 +143,11 @@ def test_gradient_of_project_agrees_with_the_definition(name: str, device: str) 
         assert isinstance(total, Tensor)
         if total.requires_grad:
             total.backward()
-        found.append([torch.zeros_like(x) if x.grad is None else x.grad for x in leaves])
+        gradients.append([torch.zeros_like(x) if x.grad is None else x.grad for x in leaves])
         culled = fields.extents[:, 0].cpu() == 0
-        for group, gradient in zip(GROUPS, found[-1], strict=False):
+        for group, gradient in zip(GROUPS, gradients[-1], strict=False):
             assert not gradient.cpu()[culled].any(), f"{group}: a culled row has a gradient"
-    for group, a, b, c in zip((*GROUPS, "viewmat"), found[2], found[1], found[0], strict=True):
+    for group, a, b, c in zip((*GROUPS, "viewmat"), gradients[2], gradients[1], gradients[0], strict=True):
         close(group, a, b, c)
 
 
@@ -161,10 +161,10 @@ def test_bin_agrees_with_the_definition_but_for_real_crossings(name: str, device
     case = case_for(name, device, 40)
     fields = single(project(case, torch.float64, "reference")[0], "cpu")
     exact = reference.bin(Projected(*(x.double() for x in fields)), case.width, case.height)
-    seen = ops.bin(single(fields, device), case.width, case.height, backend="gpu")
+    lists = ops.bin(single(fields, device), case.width, case.height, backend="gpu")
     columns = -(-case.width // TILE)
-    wanted, got = ({*pairs(exact)}, {*pairs(seen)})
-    for tile, i in wanted ^ got:
+    expected, got = ({*pairs(exact)}, {*pairs(lists)})
+    for tile, i in expected ^ got:
         a, b, c = fields.conics[i].double().tolist()
         mx, my = fields.means2d[i].double().tolist()
         xs = [tile % columns * TILE + e - mx for e in (0.5, TILE - 0.5)]
@@ -177,7 +177,7 @@ def test_bin_agrees_with_the_definition_but_for_real_crossings(name: str, device
         if (tile, i) in got:
             within += margin(fields, i, columns * TILE, -(-case.height // TILE) * TILE)
         assert abs(least - level) <= within, f"pair {tile}, {i}: {least} against {level}"
-    order = [i for _, i in pairs(seen) if (_, i) in wanted]
+    order = [i for _, i in pairs(lists) if (_, i) in expected]
     assert order == [i for _, i in pairs(exact) if (_, i) in got]
 
 
@@ -196,12 +196,12 @@ def test_a_large_image_has_tiles_to_its_last_corner(device: str) -> None:
         depths=torch.tensor([3.0, 2.0, 1.0], dtype=torch.float64),
         extents=torch.stack([half, half], dim=1),
     )
-    wanted = pairs(reference.bin(fields, width, height))
+    expected = pairs(reference.bin(fields, width, height))
     got = pairs(ops.bin(single(fields, device), width, height, backend="gpu"))
     assert -(-width // TILE) * -(-height // TILE) > gpu_bin.SHORT_TILES
-    assert max(tile for tile, _ in wanted) > gpu_bin.SHORT_TILES
-    assert sum(i == 1 for _, i in wanted) > gpu_bin.LANES
-    assert got == wanted
+    assert max(tile for tile, _ in expected) > gpu_bin.SHORT_TILES
+    assert sum(i == 1 for _, i in expected) > gpu_bin.LANES
+    assert got == expected
 
 
 def margin(fields: Projected, i: int, width: int, height: int) -> float:
@@ -328,9 +328,9 @@ def test_composite_and_its_gradient_agree_with_the_definition(
         1.0,
         max(1.0, float(fields.depths.max()) if len(fields.depths) else 0.0),
     )
-    for part, seen, exact, top in zip(("color", "alpha", "depth"), images[2], images[0], tops, strict=True):
+    for part, result, exact, top in zip(("color", "alpha", "depth"), images[2], images[0], tops, strict=True):
         allowed = (2 * top * bound + 4 * EPS * top).reshape(height, width, *[1] * (exact.dim() - 2))
-        worst = ((seen - exact).abs() / allowed).masked_fill(
+        worst = ((result - exact).abs() / allowed).masked_fill(
             near.reshape(height, width, *[1] * (exact.dim() - 2)), 0
         )
         assert float(worst.max()) <= 1, f"{part}: {float(worst.max()):.3g} of what is allowed"
@@ -345,12 +345,12 @@ def test_composite_and_its_gradient_agree_with_the_definition(
 def test_median_depth_agrees_with_the_definition(name: str, device: str) -> None:
     case = shrunk(case_for(name, device, 40), device)
     projected, bins, tilts = fields_of(case)
-    found = ops.median_depth(
+    depth = ops.median_depth(
         single(projected, device), Bins(bins.offsets.to(device), bins.ids.to(device)), case.width, case.height,
         tilts=tilts.to(device), backend="gpu",
     )  # fmt: skip
-    assert (found > 0).any()
-    agrees(name, case, found.cpu(), projected, bins, tilts)
+    assert (depth > 0).any()
+    agrees(name, case, depth.cpu(), projected, bins, tilts)
 
 
 BAD = (float("nan"), float("inf"), float("-inf"), 3.4e38, 1e-45)
@@ -367,13 +367,13 @@ def test_a_bad_number_culls_its_gaussian_and_touches_no_other(group: str, device
     for slot in {0, getattr(case, group)[0].numel() - 1}:
         poisoned = getattr(case, group).clone()
         poisoned.view(17, -1)[victims, slot] = torch.tensor(BAD)
-        seen, _ = project(replace(case, **{group: poisoned}), torch.float32, "gpu", device)
-        for field, a, b in zip(Projected._fields, seen, clean, strict=True):
+        projected, _ = project(replace(case, **{group: poisoned}), torch.float32, "gpu", device)
+        for field, a, b in zip(Projected._fields, projected, clean, strict=True):
             assert torch.equal(a.cpu()[others], b.cpu()[others]), f"{group}[{slot}] changed another's {field}"
             assert torch.isfinite(a).all(), f"{group}[{slot}] left {field} not finite"
         for victim, value in zip(victims.tolist(), BAD, strict=True):
             if not abs(value) < float("inf"):
-                assert not seen.extents[victim].any(), f"{group}[{slot}] = {value} was not culled"
+                assert not projected.extents[victim].any(), f"{group}[{slot}] = {value} was not culled"
 
 
 @BY_DEVICE
@@ -396,9 +396,9 @@ def test_a_gaussian_on_the_near_plane_is_culled(device: str) -> None:
 def test_the_length_of_a_quaternion_does_not_matter(length: float, device: str) -> None:
     case = case_for("a block and one", device, 17)
     plain, _ = project(case, torch.float32, "gpu", device)
-    seen, _ = project(replace(case, quats=case.quats * length), torch.float32, "gpu", device)
+    projected, _ = project(replace(case, quats=case.quats * length), torch.float32, "gpu", device)
     assert plain.extents.any()
-    for field, a, b in zip(Projected._fields, seen, plain, strict=True):
+    for field, a, b in zip(Projected._fields, projected, plain, strict=True):
         # The product with a power of ten rounds each component once.
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4 * b.detach().abs().max().item(), msg=field)
 
@@ -416,7 +416,7 @@ def test_loss_and_its_gradient_agree_with_the_definition(
     photo[: height // 2] = 255  # a saturated part: its variance is a difference of equal numbers
     color = torch.rand(height, width, 3, generator=g) * 1.2 - 0.1
     mask = (torch.rand(height, width, generator=g) < 0.7) if masked else None
-    found = []
+    results = []
     for dtype, backend, where in ways(device):
         x = color.to(where, dtype).clone().requires_grad_()
         here, used = photo.to(where), None if mask is None else mask.to(where)
@@ -424,8 +424,8 @@ def test_loss_and_its_gradient_agree_with_the_definition(
         value = ops.loss(x, here, dssim_weight=0.3, mask=used, stats=stats, backend=backend)
         value.backward()
         assert x.grad is not None
-        found.append((value.detach()[None], x.grad))
-    for part, a, b, c in zip(("value", "gradient"), found[2], found[1], found[0], strict=True):
+        results.append((value.detach()[None], x.grad))
+    for part, a, b, c in zip(("value", "gradient"), results[2], results[1], results[0], strict=True):
         close(part, a, b, c)
 
 
@@ -460,15 +460,15 @@ def test_adam_agrees_with_the_definition(beta2: float, device: str) -> None:
         m, v = torch.zeros_like(params), torch.zeros_like(params)
         last, refused = (torch.zeros(n, dtype=torch.int32, device=where) for n in (37, 1))
         for number, (gradient, shown) in zip((1, 2, 3, 8, 9, 5001, 30001), steps, strict=True):
-            given, seen = gradient.to(where, dtype), shown.to(where)
+            grads, visible = gradient.to(where, dtype), shown.to(where)
             if backend == "gpu":
-                missed = gpu_adam.CatchUp(seen.to(torch.uint8), last, number, beta2)
-                gpu_adam.apply_planes(params, given, m, v, rates, 59, number, beta2, refused, missed)
+                missed = gpu_adam.CatchUp(visible.to(torch.uint8), last, number, beta2)
+                gpu_adam.apply_planes(params, grads, m, v, rates, 59, number, beta2, refused, missed)
                 continue
             # float64 holds the square of 1e30; the definition's rule is about float32's.
-            given = given.where(given.abs() < 1e19, torch.inf)
-            p, g, m1, v1 = ([x.t() for x in part.split(sizes)] for part in (params, given, m, v))
-            late = {"visible": seen, "last_step": last}
+            grads = grads.where(grads.abs() < 1e19, torch.inf)
+            p, g, m1, v1 = ([x.t() for x in part.split(sizes)] for part in (params, grads, m, v))
+            late = {"visible": visible, "last_step": last}
             refused += reference.adam_(p, g, m1, v1, rates, step=number, beta2=beta2, **late)
         ends.append([*(x for part in (params, m, v) for x in part.split(sizes)), last])
         refusals.append(int(refused))
@@ -483,7 +483,7 @@ def test_knn_agrees_with_the_definition(n: int, device: str) -> None:
     points = torch.randn(n, 3, generator=torch.Generator().manual_seed(n))
     points[n // 2 :: 7] = points[0]  # duplicates are other points at distance 0
     exact = reference.knn(points.double())
-    seen = ops.knn(points.to(device), backend="gpu").cpu().double()
+    distances = ops.knn(points.to(device), backend="gpu").cpu().double()
     # A distance is the root of three squares: four roundings, each of half an ulp, on differences that are
     # exact to one.
-    assert float(((seen - exact).abs() - 8 * EPS * (exact + points.abs().max())).max()) <= 0
+    assert float(((distances - exact).abs() - 8 * EPS * (exact + points.abs().max())).max()) <= 0

@@ -58,10 +58,10 @@ def test_needles_on_the_image_are_as_exact_as_their_inputs(ratio: float) -> None
 @pytest.mark.parametrize("ratio", [3e3, 1e5])
 def test_needles_beside_the_image_are_as_exact_as_in_the_cpus_step_and_a_conic_is_not(ratio: float) -> None:
     problem = state(scenes.few_needles_beside(ratio, 0), 4)
-    seen = worst(problem, fused_gpu)
+    error = worst(problem, fused_gpu)
     # The roundings of both are the same in kind and number; which of them add up is chance.
-    assert seen <= 2 * worst(problem, fused)
-    assert worst(problem, chain) > 100 * seen
+    assert error <= 2 * worst(problem, fused)
+    assert worst(problem, chain) > 100 * error
 
 
 @pytest.mark.parametrize("ratio", [3e3, 1e6])
@@ -96,7 +96,7 @@ def test_lists_have_a_margin_for_the_roundings_of_u_and_no_more() -> None:
     edge = torch.log2(torch.tensor(255.0, dtype=torch.float64)).sqrt()
     worst_rounding = 3 * 2.0**-24 * 2 * ux * away
     y = torch.tensor(away + 0.5 - float(edge) / ux)
-    seen = set()
+    cases = set()
     for _ in range(60):
         y = torch.nextafter(y, torch.tensor(0.0))
         row = torch.zeros(1, record.WIDTH)
@@ -111,8 +111,8 @@ def test_lists_have_a_margin_for_the_roundings_of_u_and_no_more() -> None:
             assert listed, f"{outside} of the worst rounding outside"
         if outside > 4:
             assert not listed, f"{outside} of the worst rounding outside"
-        seen.add((outside <= 1, outside > 4))
-    assert len(seen) == 3, "one of the three cases did not occur"
+        cases.add((outside <= 1, outside > 4))
+    assert len(cases) == 3, "one of the three cases did not occur"
 
 
 def one(level: float, sh: float = 1.0) -> Step:
@@ -128,19 +128,19 @@ CAMERA = torch.eye(4), torch.tensor([[4.0, 0, 0.5], [0, 4.0, 0.5], [0, 0, 1.0]])
 
 def test_the_gradient_ends_where_alpha_is_clamped_and_not_before() -> None:
     opaque, clear = one(12.0), one(2.0)
-    found = []
+    gradients = []
     for step in (opaque, clear):
         color, alpha, _ = step.forward(*CAMERA, degree=0)
-        found.append(step.gradients(torch.ones_like(color)))
+        gradients.append(step.gradients(torch.ones_like(color)))
         assert float(alpha) == pytest.approx(
             min(ALPHA_MAX, float(torch.sigmoid(step.parameters()["logit_opacities"]))), rel=1e-6
         )
-    assert not found[0]["logit_opacities"].any()
-    assert found[0]["sh"].any()
+    assert not gradients[0]["logit_opacities"].any()
+    assert gradients[0]["sh"].any()
     # d alpha / d logit = o (1 - o), times the three colours; 2^x is good to 2.7e-6 on any engine.
     o = torch.sigmoid(torch.tensor(2.0, dtype=torch.float64))
     want = 3 * (0.5 + 0.28209479177387814) * o * (1 - o)
-    assert float(found[1]["logit_opacities"]) == pytest.approx(float(want), rel=1e-5)
+    assert float(gradients[1]["logit_opacities"]) == pytest.approx(float(want), rel=1e-5)
 
 
 def test_a_logit_of_16_still_has_its_gradient() -> None:
@@ -180,7 +180,7 @@ def test_a_colour_of_exactly_0_has_the_gradient_that_the_definition_gives_it() -
         torch.tensor([[0.0, 0.0, 2.0]]), torch.full((1, 3), 2.0), torch.tensor([[1.0, 0, 0, 0]]), torch.zeros(1),
     ]  # fmt: skip
     for x in candidates:
-        found = []
+        results = []
         for backend in BACKENDS:
             where = DEVICE if backend == "gpu" else "cpu"
             sh = torch.full((1, 1, 3), float(x), device=where, requires_grad=True)
@@ -191,9 +191,9 @@ def test_a_colour_of_exactly_0_has_the_gradient_that_the_definition_gives_it() -
             )  # fmt: skip
             fields.colors.sum().backward()
             assert sh.grad is not None
-            found.append((float(fields.colors[0, 0].detach()), float(sh.grad[0, 0, 0])))
-        if found[0][0] == found[1][0] == 0.0 and found[0][1] > 0:
-            assert found[1][1] == pytest.approx(0.28209479177387814)
+            results.append((float(fields.colors[0, 0].detach()), float(sh.grad[0, 0, 0])))
+        if results[0][0] == results[1][0] == 0.0 and results[0][1] > 0:
+            assert results[1][1] == pytest.approx(0.28209479177387814)
             return
     pytest.fail("no coefficient gives a colour of exactly 0 in both")
 
@@ -251,11 +251,11 @@ def test_gradients_change_nothing_and_are_those_that_an_update_takes() -> None:
     before = step.parameters()
     color, _, _ = step.forward(case.viewmat, case.K, case.width, case.height, degree=case.degree)
     weights = torch.randn(color.shape, generator=torch.Generator().manual_seed(1))
-    found = step.gradients(weights)
+    gradients = step.gradients(weights)
     assert not step.max_extent.any()
     for name, value in step.parameters().items():
         assert torch.equal(value, before[name]), name
     step.backward_update(weights, rates=Rates(*[1e-3] * 6), step=1)
-    packed = torch.cat([found[name].reshape(len(case.means), -1) for name in GROUPS], 1)
+    packed = torch.cat([gradients[name].reshape(len(case.means), -1) for name in GROUPS], 1)
     # Adam's first moment is 0.1 g; the two passes may add in another order.
     assert torch.allclose(step.moments()[0], 0.1 * packed, rtol=1e-4, atol=1e-7)

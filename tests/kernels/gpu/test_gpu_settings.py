@@ -72,9 +72,9 @@ IMAGES: dict[str, Sequence[Tensor | None]] = {
 
 def exact(
     dtype: torch.dtype, degree: int, background: Tensor | None, antialias: bool, mask: Tensor | None,
-    photo: Tensor | None, given: Sequence[Tensor | None],
+    photo: Tensor | None, weights: Sequence[Tensor | None],
 ) -> dict[str, Tensor]:  # fmt: skip
-    """The definition's gradient [12, ...] of the loss, or of the image's products with `given`, by group."""
+    """The definition's gradient [12, ...] of the loss, or of the image's products with `weights`, by group."""
     leaves = [x.requires_grad_() for x in CASE.groups(dtype)]
     means, log_scales, quats, logits, sh = leaves
     viewmat, K = CASE.camera(dtype)
@@ -88,7 +88,7 @@ def exact(
     if photo is not None:
         value = reference.loss(image[0], photo, mask=mask)
     else:
-        parts = [(x * d.to(dtype)).sum() for x, d in zip(image, given, strict=True) if d is not None]
+        parts = [(x * d.to(dtype)).sum() for x, d in zip(image, weights, strict=True) if d is not None]
         value = torch.stack(parts).sum()
     value.backward()
     return {
@@ -104,15 +104,15 @@ def gradients(here: Step) -> dict[str, Tensor]:
     return dict(zip(GROUPS, parts, strict=True))
 
 
-def check(seen: dict[str, Tensor], *definition: Any) -> None:
+def check(groups: dict[str, Tensor], *definition: Any) -> None:
     """As near to float64 as eight times the definition's own float32, or 64 roundings of the group's largest value."""
     truth, plain = (exact(dtype, *definition) for dtype in (torch.float64, torch.float32))
-    for name, value in seen.items():
-        wanted = truth[name].reshape(value.shape)
-        spread = (plain[name].double().reshape(value.shape) - wanted).abs().max()
-        allowed = 8 * spread + 64 * EPS * wanted.abs().max()
-        assert float(wanted.abs().max()) > 0 or name == "sh", f"{name} has no gradient to compare"
-        assert (value - wanted).abs().max() <= allowed, name
+    for name, value in groups.items():
+        expected = truth[name].reshape(value.shape)
+        spread = (plain[name].double().reshape(value.shape) - expected).abs().max()
+        allowed = 8 * spread + 64 * EPS * expected.abs().max()
+        assert float(expected.abs().max()) > 0 or name == "sh", f"{name} has no gradient to compare"
+        assert (value - expected).abs().max() <= allowed, name
 
 
 def trained(mode: str) -> None:
@@ -177,10 +177,10 @@ def test_every_mode_of_a_training_step_with_small_constants(
     launches: list[Launch] = []
     watch(monkeypatch, launches.append)
     trained(mode)
-    (blended,) = [launch.given for launch in launches if launch.kernel == "composite_kernel"]
+    (blended,) = [launch.arguments for launch in launches if launch.kernel == "composite_kernel"]
     lengths = torch.diff(blended["offsets"])
     assert int(lengths.max()) > 8, "no list has three segments, and none a second pass"
-    written = [x.given for x in launches if x.kernel == "pairs_kernel" and x.given["WRITE"]]
+    written = [x.arguments for x in launches if x.kernel == "pairs_kernel" and x.arguments["WRITE"]]
     assert written[0]["keys"].dtype == torch.int32
 
 
@@ -192,9 +192,9 @@ def test_every_gradient_that_an_image_may_have_with_small_constants(which: str) 
 
 def settings(kernel: Any, among: Sequence[triton.Config]) -> list[Any]:
     """The settings of a kernel; in the interpreter, where warps do not exist, one of each set of constants."""
-    found = {str(setting if DEVICE == "cuda" else setting.kwargs): setting for setting in among}
+    by_name = {str(setting if DEVICE == "cuda" else setting.kwargs): setting for setting in among}
     return [
-        pytest.param(kernel, setting, id=f"{kernel.fn.__name__} {name}") for name, setting in found.items()
+        pytest.param(kernel, setting, id=f"{kernel.fn.__name__} {name}") for name, setting in by_name.items()
     ]
 
 
@@ -301,7 +301,7 @@ def test_every_branch_of_every_kernel_is_in_the_list_and_runs(monkeypatch: pytes
     ran: dict[str, dict[str, set[Any]]] = defaultdict(lambda: defaultdict(set))
 
     def note(launch: Launch) -> None:
-        for name, value in launch.given.items():
+        for name, value in launch.arguments.items():
             if name.isupper() and (isinstance(value, bool) or name in ("USED", "BATCH")):
                 ran[launch.kernel][name].add(value)
         ran[launch.kernel]

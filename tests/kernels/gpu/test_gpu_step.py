@@ -116,14 +116,14 @@ def test_steps_agree_with_the_definition(case: Case) -> None:
     for step, number in enumerate((0, 1, 1, 0, 1), 1):
         used = mask if number else None
         loss, visible = exact.train(views[number], pictures[number], step, used)
-        seen = here.train(
+        result = here.train(
             views[number], case.K, pictures[number],
             degree=3, rates=RATES, step=step, background=case.background, mask=used,
         )  # fmt: skip
         shown.add(visible)
         if DEVICE == "cpu":  # on a device the numbers may be of an earlier step
-            assert seen.loss == pytest.approx(loss, abs=1e-6)
-            assert (seen.visible, seen.refused) == (visible, 0)
+            assert result.loss == pytest.approx(loss, abs=1e-6)
+            assert (result.visible, result.refused) == (visible, 0)
     assert len(shown) == 2, "both views show the same Gaussians, so nothing was caught up"
     exact.settle(5)
     parts = [*exact.params[:4], torch.cat(exact.params[4:], 1)]

@@ -84,10 +84,10 @@ def test_training_on_the_gpu_engine_ends_where_the_cpu_engine_ends(
     assert gpu.steps == cpu.steps == STEPS
     assert gpu.gaussians.count == cpu.gaussians.count > scene().count, "nothing was densified"
     for name, value in cpu.gaussians.parameters().items():
-        seen = gpu.gaussians.parameters()[name]
-        assert seen.device.type == "cpu", "what is handed on must not live on the device"
+        parameter = gpu.gaussians.parameters()[name]
+        assert parameter.device.type == "cpu", "what is handed on must not live on the device"
         # Three Adam steps with float32 gradients in another order of summation.
-        assert (seen - value).abs().max().item() <= 1e-4, name
+        assert (parameter - value).abs().max().item() <= 1e-4, name
     assert gpu.held_out is not None
     assert cpu.held_out is not None
     assert gpu.held_out.psnr == pytest.approx(cpu.held_out.psnr, abs=1e-2)

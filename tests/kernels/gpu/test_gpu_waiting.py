@@ -154,9 +154,9 @@ def test_an_image_that_is_judged_is_whole(
         here._rooms[case.viewmat.data_ptr(), WIDTH, HEIGHT] = room
     with nothing_waits():
         image = here.forward(case.viewmat, case.K, WIDTH, HEIGHT, degree=3, background=case.background)
-    for seen, truth in zip(image, exact, strict=True):
+    for part, truth in zip(image, exact, strict=True):
         # Eight splats at most over a pixel: some roundings of each, of values near 1; a dropped one is off by 1/255.
-        assert (seen.cpu() - truth).abs().max() < 1e-5 * max(1.0, float(truth.abs().max()))
+        assert (part.cpu() - truth).abs().max() < 1e-5 * max(1.0, float(truth.abs().max()))
     assert (here.repeated, late.waits) == ((0, 1) if room is None else (1, 2))
     assert here.overflowed == 0
 
@@ -186,13 +186,13 @@ def test_a_transparent_photo_is_laid_over_the_background_as_the_cpu_does(
     case: Case, background: Tensor | None
 ) -> None:
     behind = None if background is None else background.to(DEVICE)
-    seen = gpu_photos.over(PHOTO.to(DEVICE), ALPHA.to(DEVICE), behind).cpu()
-    off = (seen.int() - over(PHOTO, ALPHA, background).int()).abs()
+    image = gpu_photos.over(PHOTO.to(DEVICE), ALPHA.to(DEVICE), behind).cpu()
+    off = (image.int() - over(PHOTO, ALPHA, background).int()).abs()
     # A compiler may fuse the products into the sums, which moves a tie by one level.
     assert int(off.max()) <= (0 if DEVICE == "cpu" else 1)
     apart, together = engine(case), engine(case)
     more: dict[str, Any] = {"degree": 1, "rates": RATES, "step": 1, "background": background}
-    apart.train(case.viewmat, case.K, seen, **more)
+    apart.train(case.viewmat, case.K, image, **more)
     together.train(case.viewmat, case.K, PHOTO, alpha=ALPHA, **more)
     for a, b in zip(apart.moments(), together.moments(), strict=True):
         assert torch.allclose(a, b, rtol=1e-4, atol=1e-7)
@@ -249,11 +249,11 @@ def test_a_step_with_kept_statistics_is_the_step_without(case: Case, mask: Tenso
     kept, bare = engine(case), engine(case)
     bare._photos.forget_stats()
     for step in (1, 2):
-        seen = [
+        results = [
             e.train(case.viewmat, case.K, PHOTO, degree=1, rates=RATES, step=step, mask=mask)
             for e in (kept, bare)
         ]
         if DEVICE == "cpu":  # on a device the numbers may be of an earlier step
-            assert seen[0].loss == pytest.approx(seen[1].loss, abs=1e-6)
+            assert results[0].loss == pytest.approx(results[1].loss, abs=1e-6)
     for a, b in zip(kept.moments(), bare.moments(), strict=True):
         assert (a - b).abs().max() <= 1e-4 * b.abs().max()

@@ -56,17 +56,17 @@ def by_step(case: Case, threads: int = 1) -> Outputs:
     }
     camera = (*case.camera(), case.width, case.height)
     images = step.forward(*camera, **options)
-    found = {k: x.clone() for k, x in zip(IMAGES, images, strict=True)}
-    found |= step.gradients(*weights(case))
+    outputs = {k: x.clone() for k, x in zip(IMAGES, images, strict=True)}
+    outputs |= step.gradients(*weights(case))
     g = torch.Generator().manual_seed(4)
     photo = torch.randint(0, 256, (case.height, case.width, 3), dtype=torch.uint8, generator=g)
     for t in range(1, 4):
         result = step.train(*case.camera(), photo, rates=RATES, step=t, pose_gradient=True, **options)
-        found[f"loss {t}"] = torch.tensor(result.loss)
+        outputs[f"loss {t}"] = torch.tensor(result.loss)
         assert step.pose_gradient is not None
-        found[f"pose {t}"] = step.pose_gradient.clone()
+        outputs[f"pose {t}"] = step.pose_gradient.clone()
     moved = {f"moved {k}": x for k, x in step.parameters().items()}
-    return {**found, **moved, "score": step.plain_sum.clone()}
+    return {**outputs, **moved, "score": step.plain_sum.clone()}
 
 
 def rows(outputs: Outputs, count: int) -> set[str]:
@@ -166,8 +166,8 @@ def test_fuzz_no_pair_that_reaches_a_pixel_is_missing(build: str, case: Case) ->
 def test_fuzz_finite_in_finite_out_and_the_same_again(build: str, case: Case) -> None:
     with use(f"cpu:{build}"):
         ours, fused = by_ops(case), by_step(case)
-        for found in (ours, fused):
-            for k, x in found.items():
+        for outputs in (ours, fused):
+            for k, x in outputs.items():
                 assert torch.isfinite(x).all(), k
         for again in (by_ops(case), by_step(case), by_step(case, threads=2)):
             for k, x in again.items():

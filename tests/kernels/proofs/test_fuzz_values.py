@@ -76,14 +76,14 @@ def test_fuzz_loss(build: str, picture: tuple[Tensor, Tensor, Tensor | None]) ->
 def points(draw: st.DrawFn) -> Tensor:
     """Points in clusters of any size, some of them the same, some on a line or in a plane, anywhere."""
     g = torch.Generator().manual_seed(draw(SEED))
-    found = []
+    clusters = []
     for _ in range(draw(st.integers(1, 3))):
         count = draw(st.sampled_from([2, 3, 4, 5, 16, 17, 100]))
         flat = torch.tensor(draw(st.tuples(*[st.sampled_from([0.0, 1.0])] * 3)))
         centre = 10.0 ** draw(st.floats(-4, 4)) * torch.randn(3, generator=g)
         cluster = centre + 10.0 ** draw(st.floats(-6, 4)) * flat * torch.randn(count, 3, generator=g)
-        found += [cluster, cluster[: draw(st.integers(0, 4))]]
-    return torch.cat(found)
+        clusters += [cluster, cluster[: draw(st.integers(0, 4))]]
+    return torch.cat(clusters)
 
 
 @pytest.mark.parametrize("build", isa.supported())

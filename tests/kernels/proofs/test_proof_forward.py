@@ -45,11 +45,11 @@ def test_culled_rows_are_exactly_zero_and_the_same(name: str, backend: str) -> N
     case, want = CASES[name](), exact(name).want.projected
     with use(backend) as op:
         got = run(case, op).projected
-    seen, should = (got.extents.cpu() > 0).all(1), (want.extents > 0).all(1)
+    visible, should = (got.extents.cpu() > 0).all(1), (want.extents > 0).all(1)
     for field in got:
-        assert (field.detach().cpu()[~seen] == 0).all()
+        assert (field.detach().cpu()[~visible] == 0).all()
     # No case puts a Gaussian within rounding of a cull.
-    assert torch.equal(seen, should)
+    assert torch.equal(visible, should)
 
 
 @pytest.mark.parametrize("backend", backends())

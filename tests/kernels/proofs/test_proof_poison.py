@@ -141,8 +141,8 @@ def test_thresholds_are_culled_on_the_stated_side(backend: str) -> None:
         logit_opacities=torch.tensor([0.0, 0.0, edge - 1e-5, edge + 1e-5]),
     )  # fmt: skip
     with use(backend) as op:
-        seen = (run(case, op).projected.extents > 0).all(1)
-    assert seen.tolist() == [False, True, False, True]
+        visible = (run(case, op).projected.extents > 0).all(1)
+    assert visible.tolist() == [False, True, False, True]
 
 
 EXTREMES: dict[str, dict[str, object]] = {

@@ -55,7 +55,7 @@ def test_image_and_gradients_are_the_definitions(name: str, build: str) -> None:
 @pytest.mark.parametrize("build", isa.supported())
 def test_train_is_forward_loss_gradient_and_adam(build: str) -> None:
     case = CASES["ordinary"]()
-    seen = photo(case.width, case.height)
+    rgb = photo(case.width, case.height)
     mask = (torch.rand(case.height, case.width, generator=torch.Generator().manual_seed(1)) > 0.2).to(
         torch.uint8
     )
@@ -72,13 +72,13 @@ def test_train_is_forward_loss_gradient_and_adam(build: str) -> None:
                 *case.camera(), case.width, case.height, degree=case.degree, background=case.background
             )
             color = image[0].clone().requires_grad_()
-            value = ops.loss(color, seen, mask=mask, backend="cpu")
+            value = ops.loss(color, rgb, mask=mask, backend="cpu")
             (d_color,) = torch.autograd.grad(value, color)
             gradients = parts.gradients(d_color)
             assert parts.backward_update(d_color, rates=RATES, step=t) == 0
             result = fused.train(
                 *case.camera(),
-                seen,
+                rgb,
                 degree=case.degree,
                 rates=RATES,
                 step=t,
@@ -118,14 +118,14 @@ def test_train_is_forward_loss_gradient_and_adam(build: str) -> None:
 def test_threads_do_not_show(build: str) -> None:
     """Twenty steps on one thread and on two leave the same bytes everywhere."""
     case = CASES["portrait"]()
-    seen = photo(case.width, case.height)
+    rgb = photo(case.width, case.height)
     states = []
     with use(f"cpu:{build}"):
         for threads in (1, 2, 3):
             step = Step(*case.groups(), threads=threads)
             for t in range(1, 21):
                 result = step.train(
-                    *case.camera(), seen, degree=case.degree, rates=RATES, step=t, background=case.background
+                    *case.camera(), rgb, degree=case.degree, rates=RATES, step=t, background=case.background
                 )
             states.append(
                 [
@@ -147,7 +147,7 @@ def test_threads_do_not_show(build: str) -> None:
 @pytest.mark.parametrize("name", ["ordinary", "pile of transparent", "side 257x1"])
 def test_threads_do_not_show_in_the_ops(name: str, build: str) -> None:
     case = CASES[name]()
-    found = []
+    results = []
     g = torch.Generator().manual_seed(5)
     weights = [torch.randn(case.height, case.width, *s, generator=g) for s in ((3,), (), ())]
     before = torch.get_num_threads()
@@ -157,7 +157,7 @@ def test_threads_do_not_show_in_the_ops(name: str, build: str) -> None:
                 torch.set_num_threads(threads)
                 got = run(case, "cpu")
                 gradients = got.gradients(*weights)
-                found.append(
+                results.append(
                     [
                         *got.projected,
                         *got.bins,
@@ -169,5 +169,5 @@ def test_threads_do_not_show_in_the_ops(name: str, build: str) -> None:
                 )
     finally:
         torch.set_num_threads(before)
-    for a, b in zip(*found, strict=True):
+    for a, b in zip(*results, strict=True):
         assert a.detach().numpy().tobytes() == b.detach().numpy().tobytes()

@@ -55,8 +55,8 @@ def test_a_session_stands_for_its_key_until_it_is_ended(app: ServedApp, ann: dic
     sent = answer.headers["set-cookie"].lower()
     assert all(part in sent for part in ("httponly", "samesite=strict", "path=/", "max-age=43200"))
     assert "secure" not in sent
-    seen = app.http.get("/v1/me", headers=with_cookie(cookie)).json()
-    assert (seen["owner"], seen["key"], seen["scopes"]) == ("ann", ann["id"], ["read", "train"])
+    caller = app.http.get("/v1/me", headers=with_cookie(cookie)).json()
+    assert (caller["owner"], caller["key"], caller["scopes"]) == ("ann", ann["id"], ["read", "train"])
     made = app.http.post("/v1/captures", headers=with_cookie(cookie, Origin=here(app)))
     assert made.json()["owner"] == "ann"
     ended = app.http.delete("/v1/session", headers=with_cookie(cookie, Origin=here(app)))
@@ -99,17 +99,17 @@ def test_a_session_dies_with_its_key(serve: Serve, app: ServedApp, ann: dict[str
     assert status(admins, serve(api_key="another")) == 401
 
 
-@pytest.mark.parametrize("given", [{}, {"Origin": "null"}, {"Origin": "https://evil.example"}])
+@pytest.mark.parametrize("headers", [{}, {"Origin": "null"}, {"Origin": "https://evil.example"}])
 def test_a_write_with_a_cookie_comes_from_a_page_of_the_server(
-    app: ServedApp, ann: dict[str, Any], given: dict[str, str]
+    app: ServedApp, ann: dict[str, Any], headers: dict[str, str]
 ) -> None:
     _, cookie = begin(app, ann["secret"])
     for method, path in (("POST", "/v1/captures"), ("DELETE", "/v1/session"), ("POST", "/v1/jobs")):
-        answer = app.http.request(method, path, headers=with_cookie(cookie, **given))
+        answer = app.http.request(method, path, headers=with_cookie(cookie, **headers))
         problem(answer, 403, "origin_not_allowed")
     other_port = with_cookie(cookie, Origin=f"http://127.0.0.1:{app.address[1] + 1}")
     problem(app.http.post("/v1/captures", headers=other_port), 403, "origin_not_allowed")
-    assert app.http.get("/v1/me", headers=with_cookie(cookie, **given)).status_code == 200
+    assert app.http.get("/v1/me", headers=with_cookie(cookie, **headers)).status_code == 200
     site = with_cookie(cookie, **{"Sec-Fetch-Site": "same-origin"})
     assert app.http.post("/v1/captures", headers=site).status_code == 201
     # A page of another address may not make a session of its own key either.

@@ -52,8 +52,8 @@ def test_the_first_key_closes_the_server_and_is_an_admins(app: ServedApp) -> Non
     problem(app.http.get("/v1/jobs"), 401, "unauthorized")
     ann = make(app, root["secret"], name="Ann's laptop", owner="ann")
     assert ann["scopes"] == ["read", "train"]
-    seen = me(app, ann["secret"]).json()
-    assert seen == {
+    caller = me(app, ann["secret"]).json()
+    assert caller == {
         "owner": "ann",
         "key": ann["id"],
         "key_name": "Ann's laptop",
@@ -79,7 +79,7 @@ def test_a_secret_is_recognisable_and_stored_as_a_digest_alone(app: ServedApp) -
 
 
 @pytest.mark.parametrize(
-    "given",
+    "pattern",
     [
         "smk_",
         "smk_0000000000000000_" + "0" * 64,
@@ -91,10 +91,10 @@ def test_a_secret_is_recognisable_and_stored_as_a_digest_alone(app: ServedApp) -
         "é",
     ],
 )
-def test_a_wrong_secret_is_refused(app: ServedApp, given: str) -> None:
+def test_a_wrong_secret_is_refused(app: ServedApp, pattern: str) -> None:
     root = make(app, **ADMIN)
     other = root["secret"][:-1] + ("0" if root["secret"][-1] != "0" else "1")
-    text = given.format(id=root["id"], secret=root["secret"], Secret=root["secret"].upper(), other=other)
+    text = pattern.format(id=root["id"], secret=root["secret"], Secret=root["secret"].upper(), other=other)
     answer = app.http.get("/v1/me", headers={b"Authorization": f"Bearer {text}".encode()})
     problem(answer, 401, "unauthorized")
     assert answer.headers["www-authenticate"] == "Bearer"
@@ -176,8 +176,8 @@ def test_the_key_of_the_setting_is_an_admin_beside_stored_keys(serve: Serve) -> 
     app = serve(api_key="s3cret")
     ann = make(app, "s3cret", name="ann", owner="ann")
     assert me(app, ann["secret"]).json()["owner"] == "ann"
-    seen = me(app, "s3cret").json()
-    assert (seen["owner"], seen["key"], seen["key_name"]) == ("default", None, "SPLATMILL_API_KEY")
+    caller = me(app, "s3cret").json()
+    assert (caller["owner"], caller["key"], caller["key_name"]) == ("default", None, "SPLATMILL_API_KEY")
     root = make(app, "s3cret", **ADMIN)
     assert app.http.delete(f"/v1/keys/{root['id']}").status_code == 204
 

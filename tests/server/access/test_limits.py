@@ -39,10 +39,10 @@ def test_a_minute_of_requests_is_shared_by_all_api_processes(serve: Serve, app: 
     other = serve(api_key="s3cret")
     answers = [at.http.get("/v1/me", headers=bearer(ann)) for at in (app, other) for _ in range(4)]
     assert [answer.status_code for answer in answers] == [200] * 6 + [429] * 2
-    found = problem(answers[-1], 429, "too_many_requests")
+    refusal = problem(answers[-1], 429, "too_many_requests")
     # Six a minute are one in ten seconds.
     assert 1 <= int(answers[-1].headers["retry-after"]) <= 10
-    assert found["facts"]["requests_per_minute"] == 6
+    assert refusal["facts"]["requests_per_minute"] == 6
     assert app.http.get("/v1/me", headers=bearer(bob)).status_code == 200
     assert app.http.get("/v1/me").status_code == 200
     assert app.http.get("/healthz", headers=bearer(ann)).status_code == 200
@@ -100,13 +100,13 @@ def test_unfinished_jobs_are_counted_and_named(app: ServedApp, ann: dict[str, An
     app.job()  # of another owner, which does not count
     first, second = (post_job(app, ann, capture).json()["id"] for _ in range(2))
     refused = post_job(app, ann, capture, **{"Idempotency-Key": "third"})
-    found = problem(refused, 429, "too_many_jobs")
-    assert found["facts"] == {"unfinished_jobs": 2, "limit": 2}
-    assert "2 unfinished jobs" in found["detail"]
+    refusal = problem(refused, 429, "too_many_jobs")
+    assert refusal["facts"] == {"unfinished_jobs": 2, "limit": 2}
+    assert "2 unfinished jobs" in refusal["detail"]
     form: dict[str, Any] = {"files": [("images", (f"{n}.jpg", b"photo %d" % n)) for n in range(2)]}
     problem(app.http.post("/v1/jobs", headers=bearer(ann), **form), 429, "too_many_jobs")
     captures = app.http.get("/v1/captures", headers=bearer(ann)).json()["captures"]
-    assert [found["id"] for found in captures] == [capture]
+    assert [entry["id"] for entry in captures] == [capture]
     assert app.http.get("/v1/me", headers=bearer(ann)).json()["use"]["unfinished_jobs"] == 2
     assert app.http.post(f"/v1/jobs/{first}/cancel", headers=bearer(ann)).json()["state"] == "cancelled"
     third = post_job(app, ann, capture, **{"Idempotency-Key": "third"})

@@ -55,7 +55,7 @@ class Person:
         return self("POST", "/v1/jobs", json={"capture": capture, "options": options or {}}, **more)
 
     def listed(self, kind: str, query: str = "") -> list[str]:
-        return [found["id"] for found in self("GET", f"/v1/{kind}{query}").json()[kind]]
+        return [record["id"] for record in self("GET", f"/v1/{kind}{query}").json()[kind]]
 
 
 @pytest.fixture
@@ -83,12 +83,12 @@ def test_every_record_names_its_owner_and_is_listed_for_it_alone(
     job = ann.job(capture).json()
     finished(app, job["id"], "ann")
     assert job["owner"] == "ann"
-    for kind, found in (("captures", capture), ("jobs", job["id"]), ("models", job["id"])):
-        assert ann("GET", f"/v1/{kind}/{found}").json()["owner"] == "ann"
-        assert ann.listed(kind) == [found]
+    for kind, record_id in (("captures", capture), ("jobs", job["id"]), ("models", job["id"])):
+        assert ann("GET", f"/v1/{kind}/{record_id}").json()["owner"] == "ann"
+        assert ann.listed(kind) == [record_id]
         assert bob.listed(kind) == []
         assert bob.listed(kind, "?owner=ann") == []
-        problem(bob("GET", f"/v1/{kind}/{found}"), 404, f"{kind[:-1]}_not_found")
+        problem(bob("GET", f"/v1/{kind}/{record_id}"), 404, f"{kind[:-1]}_not_found")
 
 
 def test_an_admin_sees_all_owners_and_may_choose_one(app: ServedApp, ann: Person, bob: Person) -> None:
@@ -105,18 +105,18 @@ def test_an_admin_sees_all_owners_and_may_choose_one(app: ServedApp, ann: Person
 
 def test_pages_of_one_owner_skip_the_others_and_end(app: ServedApp, ann: Person, bob: Person) -> None:
     mine, yours = ann.capture(), bob.capture()
-    wanted = []
+    jobs = []
     for _ in range(3):
-        wanted.append(ann.job(mine).json()["id"])
+        jobs.append(ann.job(mine).json()["id"])
         for _ in range(4):
             bob.job(yours)
-    found, cursor = [], ""
+    ids, cursor = [], ""
     while cursor is not None:
         page = ann("GET", f"/v1/jobs?limit=1{cursor and '&cursor=' + cursor}").json()
-        found += [job["id"] for job in page["jobs"]]
+        ids += [job["id"] for job in page["jobs"]]
         cursor = page["cursor"]
-    assert sorted(found) == sorted(wanted)
-    assert len(found) == 3
+    assert sorted(ids) == sorted(jobs)
+    assert len(ids) == 3
 
 
 def test_a_job_uses_only_what_its_owner_may_see(app: ServedApp, ann: Person, bob: Person) -> None:

@@ -63,14 +63,16 @@ class World:
 def operations() -> list[tuple[str, str, dict[str, Any]]]:
     with tempfile.TemporaryDirectory() as folder:
         document = create_app(Settings(data=Path(folder))).openapi()
-    found = [
+    all_operations = [
         (method, path, operation)
         for path, methods in document["paths"].items()
         for method, operation in methods.items()
     ]
-    assert len(found) > 25
-    assert [path for _, path, _ in found if path.startswith(LINKS)]
-    return [(method, path, operation) for method, path, operation in found if not path.startswith(LINKS)]
+    assert len(all_operations) > 25
+    assert [path for _, path, _ in all_operations if path.startswith(LINKS)]
+    return [
+        (method, path, operation) for method, path, operation in all_operations if not path.startswith(LINKS)
+    ]
 
 
 @pytest.fixture
@@ -120,13 +122,15 @@ def test_another_owner_learns_nothing(
 ) -> None:
     tried = 0
     for method, path, operation in operations:
-        names = {found["name"] for found in operation.get("parameters", []) if found["in"] == "path"}
+        names = {
+            parameter["name"] for parameter in operation.get("parameters", []) if parameter["in"] == "path"
+        }
         answer = world.ask("bob", method, path)
         if names & OWN and method == "head":
             assert answer.status_code == 404, path
         elif names & OWN:
-            found = problem(answer, 404, answer.json()["code"])
-            assert found["code"] in {f"{name.removesuffix('_id')}_not_found" for name in names & OWN}, path
+            refusal = problem(answer, 404, answer.json()["code"])
+            assert refusal["code"] in {f"{name.removesuffix('_id')}_not_found" for name in names & OWN}, path
             tried += 1
         elif answer.status_code == 403:
             needed = problem(answer, 403, "forbidden")["facts"]["needed"]
@@ -150,9 +154,9 @@ def test_a_read_only_key_changes_nothing(
             admins = admins and answer.json()["facts"]["needed"] in ("admin", "metrics")
             assert admins or answer.status_code not in (401, 403), (method, path)
         else:
-            found = problem(answer, 403, "forbidden")
-            assert found["facts"]["needed"] in ("train", "admin"), (method, path)
-            assert repr(found["facts"]["needed"]) in found["detail"]
+            refusal = problem(answer, 403, "forbidden")
+            assert refusal["facts"]["needed"] in ("train", "admin"), (method, path)
+            assert repr(refusal["facts"]["needed"]) in refusal["detail"]
             refused.add((method, path))
     assert ("post", "/v1/jobs") in refused
     assert ("put", "/v1/captures/{capture_id}/{role}/{name}") in refused
@@ -194,5 +198,5 @@ def test_only_an_admin_learns_the_machines_of_workers(world: World) -> None:
     assert world.ask("root", "get", "/v1/info").json()["workers"][0]["name"] == "render-7.lan-4711-abc123"
     for who in ("ann", "reader", "bob"):
         shown = world.ask(who, "get", "/v1/info")
-        assert [found["name"] for found in shown.json()["workers"]] == ["worker-1"]
+        assert [entry["name"] for entry in shown.json()["workers"]] == ["worker-1"]
         assert "render-7" not in shown.text

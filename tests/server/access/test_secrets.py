@@ -37,7 +37,7 @@ class Watched:
     """Requests to a server, and everything that it answered, but for what it is asked to show once."""
 
     http: httpx.Client
-    seen: list[str] = field(default_factory=list)
+    answers: list[str] = field(default_factory=list)
 
     def ask(
         self, method: str, path: str, *, key: str = API_KEY, shown: bool = True, **more: Any
@@ -46,7 +46,7 @@ class Watched:
         answer = self.http.request(method, path, headers=headers, **more)
         self.http.cookies.clear()
         if shown:
-            self.seen.append(f"{answer.status_code} {answer.headers} {answer.text}")
+            self.answers.append(f"{answer.status_code} {answer.headers} {answer.text}")
         return answer
 
 
@@ -163,7 +163,7 @@ def test_no_output_shows_a_secret(store: RedisServer, tmp_path: Path) -> None:
         server.ask("GET", "/v1/me", headers=in_use)
     outputs = {
         "the log": log.read_text(),
-        "an answer": "\n".join(server.seen),
+        "an answer": "\n".join(server.answers),
         "the doctor": doctor(env),
         "storage": stored,
         "Redis": kept,
@@ -187,7 +187,7 @@ def test_a_bucket_that_does_not_answer_shows_no_secret(tmp_path: Path, redis_url
     log = tmp_path / "log"
     with served(env, log) as server:
         assert server.ask("GET", f"/v1/captures/{'0' * 16}").status_code == 503
-    text = log.read_text() + "".join(server.seen) + doctor(env)
+    text = log.read_text() + "".join(server.answers) + doctor(env)
     assert "Storage could not" in text
     for secret in (BUCKET_SECRET, API_KEY):
         assert secret not in text

@@ -55,7 +55,7 @@ def app(serve: Serve, folder: Path, renderer: subprocess.Popen[bytes]) -> Served
 def _formats(app: ServedApp) -> dict[str, dict[str, Any]]:
     answer = app.http.get(f"/v1/models/{MODEL}/formats")
     assert answer.status_code == 200
-    return {found["format"]: found for found in answer.json()["formats"]}
+    return {entry["format"]: entry for entry in answer.json()["formats"]}
 
 
 def test_a_format_is_made_once_and_kept_with_its_quality_on_held_out_photos(
@@ -72,9 +72,9 @@ def test_a_format_is_made_once_and_kept_with_its_quality_on_held_out_photos(
     assert answer.headers["content-disposition"] == f"attachment; filename*=UTF-8''{MODEL}.sog"
     (tmp_path / "m.sog").write_bytes(answer.content)
     assert registry.read(tmp_path / "m.sog").gaussians.count == 400
-    found = _formats(app)["sog"]
-    made = found["conversion"]
-    assert found["bytes"] == len(answer.content) < before["ply"]["bytes"]
+    sog = _formats(app)["sog"]
+    made = sog["conversion"]
+    assert sog["bytes"] == len(answer.content) < before["ply"]["bytes"]
     assert (made["compared_with"], made["pictures"], made["psnr_before"]) == ("held_out", 3, 50.0)
     assert 30 < made["psnr"] < 70  # against the model's own 8-bit pictures; the magenta half does not count
     assert 0.9 < made["ssim"] <= 1
@@ -156,8 +156,8 @@ def test_a_model_that_changed_is_converted_again_and_a_deleted_one_takes_its_for
 
 
 def test_refusals(app: ServedApp, serve: Serve, folder: Path) -> None:
-    found = problem(app.http.get(f"/v1/models/{MODEL}/download/obj"), 404, "format_unknown")
-    assert "sog" in found["facts"]["formats"]
+    refusal = problem(app.http.get(f"/v1/models/{MODEL}/download/obj"), 404, "format_unknown")
+    assert "sog" in refusal["facts"]["formats"]
     problem(app.http.get(f"/v1/models/{'b' * 16}/download/sog"), 404, "model_not_found")
     problem(app.http.get(f"/v1/models/{'b' * 16}/formats"), 404, "model_not_found")
     ply = app.http.get(f"/v1/models/{MODEL}/download/ply")
@@ -179,8 +179,8 @@ def test_a_renderer_that_ends_within_its_answer_is_asked_again(
         server.answer = lambda _: cut
         broken = serve(renderer_url=server.url, storage=str(folder / "storage"))
         answer = broken.http.get(f"/v1/models/{MODEL}/download/spz")
-    found = problem(answer, 503, "renderer_unavailable")
-    assert "ended while it sent" in found["detail"]
+    refusal = problem(answer, 503, "renderer_unavailable")
+    assert "ended while it sent" in refusal["detail"]
     assert answer.headers["retry-after"] == "5"
     assert _formats(app)["spz"]["bytes"] is None
 

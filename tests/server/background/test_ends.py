@@ -64,8 +64,8 @@ def test_a_webhook_comes_when_the_job_ends(app: ServedApp, peer: ScriptedServer,
             app.finish(job_id)
         else:
             app.say(job_id, FAILED)
-    wait_for(lambda: peer.seen)
-    payload = verify_webhook(peer.seen[0].headers, peer.seen[0].body, made["secret"])
+    wait_for(lambda: peer.requests)
+    payload = verify_webhook(peer.requests[0].headers, peer.requests[0].body, made["secret"])
     assert (payload["type"], payload["data"]["id"]) == (f"job.{state}", job_id)
     assert wait_for(lambda: not app.redis.sismember(keys.ACTIVE, job_id))
     assert app.redis.llen(keys.ENDS) == 0
@@ -79,7 +79,7 @@ def test_a_job_that_the_reaper_gives_up_is_announced_at_once(app: ServedApp, pee
     for _ in range(leases.MAX_LOST):
         leases.requeue(app.redis, take(app.redis), if_expired=False)
     app.service.reaper.tick()
-    wait_for(lambda: peer.seen)
+    wait_for(lambda: peer.requests)
     assert app.state(job_id) == "failed"
 
 
@@ -99,7 +99,7 @@ def test_a_failed_attempt_is_repeated_when_it_is_due(
     answer = app.http.post(f"/v1/webhooks/{made['id']}/deliveries/{delivery['id']}/repeat")
     assert answer.status_code == 202
     wait_for(lambda: [d for d in log_of(app, made) if len(d["attempts"]) > 2 and d["state"] == "delivered"])
-    assert [request.path for request in peer.seen] == 3 * ["/hook"], log_of(app, made)
+    assert [request.path for request in peer.requests] == 3 * ["/hook"], log_of(app, made)
 
 
 def test_one_of_several_processes_announces_an_end(
@@ -121,7 +121,7 @@ def test_one_of_several_processes_announces_an_end(
         app.say(job_id, FAILED)
 
         def all_came(number: int = number) -> bool:
-            return len(peer.seen) == number
+            return len(peer.requests) == number
 
         wait_for(all_came)
     assert len(retired) == len(set(retired)) == 4
@@ -149,9 +149,9 @@ def test_an_end_of_a_job_that_is_unknown_or_was_restarted_does_no_harm(
     job_id = app.job()
     app.begin(job_id)
     app.say(job_id, FAILED)
-    wait_for(lambda: peer.seen)
+    wait_for(lambda: peer.requests)
     assert app.state(waiting) == "queued"
     assert app.redis.sismember(keys.ACTIVE, waiting)
-    found = row.read(app.redis, waiting)
-    assert found is not None
-    assert found.options == TrainOptions()
+    job_row = row.read(app.redis, waiting)
+    assert job_row is not None
+    assert job_row.options == TrainOptions()

@@ -67,7 +67,7 @@ def test_a_file_is_fetched_and_stored_as_an_upload_is(app: ServedApp, peer: Scri
     assert (done["received"], done["size"], done["attempts"]) == (len(DATA), len(DATA), 1)
     assert app.http.get(f"/v1/captures/{capture_id}").json()["files"] == [done["file"]]
     assert app.service.storage.get(layout.capture_file(capture_id, Role.images, "my kitchen.zip")) == DATA
-    assert peer.seen[0].path == "/sets/my%20kitchen.zip?token=1"
+    assert peer.requests[0].path == "/sets/my%20kitchen.zip?token=1"
     # A second import of the same bytes under another role and name, and the list of both.
     other = ended(app, begin(app, capture_id, f"{peer.url}/x", role="poses", name="sparse/0/images.bin"))
     assert other["file"]["name"] == "sparse/0/images.bin"
@@ -82,10 +82,10 @@ def test_what_cannot_be_stored_is_a_failed_import_with_its_reason(serve: Serve, 
 
     def failed(reply: Reply, code: str, **more: Any) -> Any:
         peer.answer = lambda _: reply
-        found = ended(app, begin(app, capture_id, f"{peer.url}/a.jpg", **more))
-        assert found["state"] == "failed"
-        assert found["problem"]["code"] == code, found
-        return found
+        record = ended(app, begin(app, capture_id, f"{peer.url}/a.jpg", **more))
+        assert record["state"] == "failed"
+        assert record["problem"]["code"] == code, record
+        return record
 
     failed(Reply(body=b"x" * 1001), "body_too_large")
     # The limit also holds where no length is announced.
@@ -122,7 +122,7 @@ def test_an_address_is_refused_at_once(app: ServedApp, peer: ScriptedServer) -> 
     )
     problem(app.http.get(f"/v1/captures/{capture_id}/imports/0123456789abcdef"), 404, "import_not_found")
     assert stored(app) == before
-    assert peer.seen == []
+    assert peer.requests == []
 
 
 def test_a_server_that_fails_for_a_while_is_asked_again(app: ServedApp, peer: ScriptedServer) -> None:
@@ -148,14 +148,14 @@ def test_an_import_goes_on_after_a_restart_of_the_server(
     first = serve(outgoing_allow=allow)
     capture_id = capture(first)
     address = begin(first, capture_id, f"{peer.url}/a.mp4")
-    wait_for(lambda: len(peer.seen) == 1)
+    wait_for(lambda: len(peer.requests) == 1)
     # A second process leaves it alone while the first one has it.
     second = serve(outgoing_allow=allow)
     key = keys.lease("import", f"{capture_id}.{address.rsplit('/', 1)[1]}")
     wait_for(lambda: first.redis.exists(key) == 1)
     peer.answer = lambda _: Reply(body=DATA)
     assert second.http.get(address).json()["state"] == "running"
-    assert len(peer.seen) == 1
+    assert len(peer.requests) == 1
     # What a killed process leaves: a record, a mark, and a lease that expires.
     first.service.imports.unfinished.running[f"{capture_id}.{address.rsplit('/', 1)[1]}"].cancel()
     done = ended(second, address)
@@ -181,7 +181,7 @@ def test_a_redirect_to_an_address_that_cannot_be_read_ends_the_import(
     done = ended(app, begin(app, capture(app), f"{peer.url}/a.jpg"))
     assert (done["state"], done["problem"]["code"], done["attempts"]) == ("failed", "url_refused", 1)
     assert "'http://xn--/' is not an address" in done["problem"]["detail"]
-    assert len(peer.seen) == 1
+    assert len(peer.requests) == 1
 
 
 def test_an_error_that_nobody_expected_counts_as_an_attempt(
@@ -194,4 +194,4 @@ def test_an_error_that_nobody_expected_counts_as_an_attempt(
     done = ended(app, begin(app, capture(app), f"{peer.url}/a.jpg"))
     assert (done["state"], done["attempts"]) == ("failed", imports.MAX_ATTEMPTS)
     assert "unexpected error (RecursionError)" in done["problem"]["detail"]
-    assert len(peer.seen) == imports.MAX_ATTEMPTS
+    assert len(peer.requests) == imports.MAX_ATTEMPTS

@@ -16,15 +16,17 @@ from splatmill_server.background import imports
 from splatmill_server.base import least_rate, unfinished
 from splatmill_server.space import usage
 from tests.support.served_app import Serve, ServedApp, problem, stored
-from tests.support.servers.scripted_server import Reply, ScriptedServer, Seen, scripted_server
+from tests.support.servers.scripted_server import Reply, Request, ScriptedServer, scripted_server
 from tests.support.waiting import wait_for
 
 CRAWLING = Reply(body=b"x" * 5000, pace=0.05)
 """20 bytes a second, for four minutes."""
 
 
-def answer(seen: Seen) -> Reply:
-    return {"/slow": CRAWLING, "/busy": Reply(status=503)}.get(seen.path.split("?")[0], Reply(body=b"photo"))
+def answer(request: Request) -> Reply:
+    return {"/slow": CRAWLING, "/busy": Reply(status=503)}.get(
+        request.path.split("?")[0], Reply(body=b"photo")
+    )
 
 
 @pytest.fixture
@@ -58,10 +60,10 @@ def test_slow_imports_of_one_owner_do_not_hold_up_another_owner(app: ServedApp, 
     captures = [capture(app) for _ in range(5)]
     for number in range(20):
         begin(app, captures[number % 5], f"{peer.url}/slow", f"{number}.jpg")
-    wait_for(lambda: len(peer.seen) >= 3)
+    wait_for(lambda: len(peer.requests) >= 3)
     other = begin(app, capture(app, "bob"), f"{peer.url}/fast")
     wait_for(lambda: state(app, other) == "succeeded", 10)
-    assert len([seen for seen in peer.seen if seen.path == "/slow"]) == imports._CONCURRENT_EACH
+    assert len([request for request in peer.requests if request.path == "/slow"]) == imports._CONCURRENT_EACH
 
 
 def test_a_pause_before_another_attempt_holds_no_slot(
@@ -84,7 +86,7 @@ def test_no_other_process_cuts_a_pause_short(
     apps = [serve(outgoing_allow=peer.url.removeprefix("http://")) for _ in range(2)]
     begun = time.monotonic()
     address = begin(apps[0], capture(apps[0]), f"{peer.url}/busy")
-    wait_for(lambda: len(peer.seen) == 2)
+    wait_for(lambda: len(peer.requests) == 2)
     assert time.monotonic() - begun > 1.5
     assert apps[1].http.get(address).json()["attempts"] == 2
 
@@ -97,11 +99,11 @@ def test_a_server_that_sends_too_slowly_fails_the_import(
     app = serve(outgoing_allow=allowed, min_import_rate=200)
     address = begin(app, capture(app), f"{peer.url}/slow")
     wait_for(lambda: state(app, address) == "failed", 10)
-    found = app.http.get(address).json()
-    assert found["problem"]["code"] == "import_failed"
-    assert "200 B per second" in found["problem"]["detail"], found
-    assert "SPLATMILL_MIN_IMPORT_RATE" in found["problem"]["detail"]
-    assert found["attempts"] == 1
+    record = app.http.get(address).json()
+    assert record["problem"]["code"] == "import_failed"
+    assert "200 B per second" in record["problem"]["detail"], record
+    assert "SPLATMILL_MIN_IMPORT_RATE" in record["problem"]["detail"]
+    assert record["attempts"] == 1
     assert not any("incoming" in path or "files" in path for path in stored(app))
     # One that is fast enough may take any number of windows, and 0 admits any rate.
     peer.answer = lambda _: Reply(body=b"x" * 40, pace=0.05)
@@ -117,16 +119,16 @@ def test_a_server_that_never_answers_fails_the_import(
     monkeypatch.setattr(imports, "_ANSWER_SECONDS", 0.2)
     monkeypatch.setattr(imports, "_PAUSE_SECONDS", 0.01)
 
-    async def never(_: Seen) -> Reply:
+    async def never(_: Request) -> Reply:
         await asyncio.sleep(60)
         return Reply()
 
     peer.answer = never
     address = begin(app, capture(app), f"{peer.url}/a.jpg")
     wait_for(lambda: state(app, address) == "failed", 20)
-    found = app.http.get(address).json()
-    assert (found["attempts"], found["problem"]["code"]) == (imports.MAX_ATTEMPTS, "import_failed")
-    assert "did not begin to answer" in found["problem"]["detail"]
+    record = app.http.get(address).json()
+    assert (record["attempts"], record["problem"]["code"]) == (imports.MAX_ATTEMPTS, "import_failed")
+    assert "did not begin to answer" in record["problem"]["detail"]
 
 
 @pytest.mark.parametrize("elsewhere", [False, True])
@@ -136,7 +138,7 @@ def test_the_deletion_of_a_capture_ends_its_imports_at_once(
     monkeypatch.setattr(unfinished, "DELETED_SECONDS", 0.1 if elsewhere else 60.0)
     capture_id = capture(app)
     begin(app, capture_id, f"{peer.url}/slow")
-    wait_for(lambda: len(peer.seen) == 1)
+    wait_for(lambda: len(peer.requests) == 1)
     other = (
         serve() if elsewhere else app
     )  # a process that does not run the import, which the first one has begun
@@ -169,19 +171,19 @@ def test_an_import_waits_while_storage_is_listed_for_the_first_time(
     monkeypatch.setattr(usage, "_FIRST_SCAN_SECONDS", 0.1)
     app = serve(outgoing_allow=peer.url.removeprefix("http://"), quota=10**9)
 
-    def lose_figures(seen: Seen) -> Reply:
+    def lose_figures(request: Request) -> Reply:
         """Let Redis lose the last scan while another process makes a new one, until the third attempt."""
         connection = app.service.redis
-        if len(peer.seen) == 1:
+        if len(peer.requests) == 1:
             connection.set(keys.SCAN_LOCK, "another process", ex=30)
             connection.delete(keys.SCAN)
             return Reply(status=503)
-        if len(peer.seen) == 3:
+        if len(peer.requests) == 3:
             connection.delete(keys.SCAN_LOCK)
         return Reply(body=b"photo")
 
     peer.answer = lose_figures
     address = begin(app, capture(app), f"{peer.url}/a.jpg")
     wait_for(lambda: state(app, address) in ("succeeded", "failed"))
-    found = app.http.get(address).json()
-    assert (found["state"], found["attempts"]) == ("succeeded", 3), found
+    record = app.http.get(address).json()
+    assert (record["state"], record["attempts"]) == ("succeeded", 3), record

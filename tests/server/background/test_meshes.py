@@ -68,12 +68,12 @@ def around() -> bytes:
 
 def makers(renderer: subprocess.Popen[bytes]) -> list[psutil.Process]:
     """The processes of the renderer that make meshes."""
-    found = []
+    processes = []
     for each in psutil.Process(renderer.pid).children():
         with suppress(psutil.Error):  # it has ended
             if "mesh-file" in each.cmdline():
-                found.append(each)
-    return found
+                processes.append(each)
+    return processes
 
 
 def caught(renderer: subprocess.Popen[bytes]) -> psutil.Process:
@@ -134,13 +134,13 @@ def test_a_mesh_is_made_in_the_background_kept_and_found_again(
     assert (again.status_code, again.json()) == (200, done)
     cut = KEPT.begun(app, format="ply", box={"min": [-2, -2, 0], "max": [1e9, 2, 2]})
     assert KEPT.ended(app, cut["id"])["state"] == "succeeded"
-    assert [found["id"] for found in app.http.get(MESHES).json()["meshes"]] == [cut["id"], made["id"]]
+    assert [mesh["id"] for mesh in app.http.get(MESHES).json()["meshes"]] == [cut["id"], made["id"]]
     app.service.usage.scan()
     listed = app.http.get("/v1/storage").json()["largest"]
     held = sum(entry.size for entry in app.service.storage.entries(layout.model(MODEL)))
-    assert [found["bytes"] for found in listed if found["id"] == MODEL] == [held]
+    assert [entry["bytes"] for entry in listed if entry["id"] == MODEL] == [held]
     assert app.http.delete(f"{MESHES}/{cut['id']}").status_code == 204
-    assert [found["id"] for found in app.http.get(MESHES).json()["meshes"]] == [made["id"]]
+    assert [mesh["id"] for mesh in app.http.get(MESHES).json()["meshes"]] == [made["id"]]
     problem(app.http.get(cut["links"]["file"]), 404, "mesh_not_found")
 
 

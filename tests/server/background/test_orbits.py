@@ -63,13 +63,13 @@ def test_a_video_waits_while_storage_is_listed_for_the_first_time(
     monkeypatch.setattr(usage, "_FIRST_SCAN_SECONDS", 0.1)
     app = serve_in(serve, folder, quota=10**9)
     store_only_ball(app, folder, MODEL)
-    found = KEPT.begun(app, width=640, height=480, seconds=4)
+    orbit = KEPT.begun(app, width=640, height=480, seconds=4)
     # Redis loses the last scan while another process makes a new one.
     app.service.redis.set(keys.SCAN_LOCK, "another process", ex=60)
     app.service.redis.delete(keys.SCAN)
     wait_for(lambda: app.service.orbits._failures)
     app.service.redis.delete(keys.SCAN_LOCK)
-    assert KEPT.ended(app, found["id"])["state"] == "succeeded"
+    assert KEPT.ended(app, orbit["id"])["state"] == "succeeded"
 
 
 def test_a_video_is_rendered_in_the_background_kept_and_found_again(app: ServedApp) -> None:
@@ -100,14 +100,14 @@ def test_a_video_is_rendered_in_the_background_kept_and_found_again(app: ServedA
     assert other["id"] != made["id"]
     KEPT.ended(app, other["id"])
     listed = app.http.get(ORBITS).json()["orbits"]
-    assert [found["id"] for found in listed] == [other["id"], made["id"]]
+    assert [orbit["id"] for orbit in listed] == [other["id"], made["id"]]
     # It counts as what the owner has in storage, and goes with the model.
     app.service.usage.scan()
     listed = app.http.get("/v1/storage").json()["largest"]
     held = sum(entry.size for entry in app.service.storage.entries(layout.model(MODEL)))
-    assert [found["bytes"] for found in listed if found["id"] == MODEL] == [held]
+    assert [entry["bytes"] for entry in listed if entry["id"] == MODEL] == [held]
     assert app.http.delete(f"/v1/models/{MODEL}/orbits/{other['id']}").status_code == 204
-    assert [found["id"] for found in app.http.get(ORBITS).json()["orbits"]] == [made["id"]]
+    assert [orbit["id"] for orbit in app.http.get(ORBITS).json()["orbits"]] == [made["id"]]
     problem(app.http.get(other["links"]["video"]), 404, "orbit_not_found")
 
 
@@ -125,8 +125,8 @@ def test_a_video_that_is_deleted_is_not_rendered_any_further(
     try:
         made = KEPT.begun(app)
         wait_for(lambda: bool(app.service.orbits.unfinished._working))
-        found = problem(app.http.get(made["links"]["video"]), 409, "orbit_not_ready")
-        assert found["facts"]["frames"] == 10
+        refusal = problem(app.http.get(made["links"]["video"]), 409, "orbit_not_ready")
+        assert refusal["facts"]["frames"] == 10
         assert app.http.delete(f"{ORBITS}/{made['id']}").status_code == 204
         wait_for(lambda: not app.service.orbits.unfinished.running)
     finally:
@@ -146,12 +146,12 @@ def test_a_video_goes_on_where_an_api_that_was_stopped_left_it(
     async def nothing() -> None:
         pass
 
-    async def killed_after_four_frames(self: Any, name: str, found: Any) -> Any:
-        asked.append(found.frames_done)
-        if found.frames_done == 4 and self is app.service.orbits:
+    async def killed_after_four_frames(self: Any, name: str, record: Any) -> Any:
+        asked.append(record.frames_done)
+        if record.frames_done == 4 and self is app.service.orbits:
             monkeypatch.setattr(self.unfinished, "_take_up", nothing)
             self.unfinished.running[name].cancel()
-        return await next_part(self, name, found)
+        return await next_part(self, name, record)
 
     monkeypatch.setattr(orbits.Orbits, "_next", killed_after_four_frames)
     made = KEPT.begun(app)
@@ -246,17 +246,17 @@ def test_what_is_refused_is_refused_before_it_waits(
     renderer.send_signal(signal.SIGSTOP)
     try:
         two = [KEPT.begun(app)["id"], KEPT.begun(app, fps=11)["id"]]
-        found = problem(app.http.post(ORBITS, json=WISH | {"fps": 12}), 409, "too_many_orbits")
-        assert found["facts"]["limit"] == 2
-        assert "owner" in found["detail"]
+        refusal = problem(app.http.post(ORBITS, json=WISH | {"fps": 12}), 409, "too_many_orbits")
+        assert refusal["facts"]["limit"] == 2
+        assert "owner" in refusal["detail"]
         KEPT.begun(app)  # which waits already
         assert len(app.service.orbits.unfinished.running) <= 1, "videos of an owner are rendered one by one"
     finally:
         renderer.send_signal(signal.SIGCONT)
     for orbit_id in two:
         KEPT.ended(app, orbit_id)
-    found = problem(app.http.post(ORBITS, json=WISH | {"fps": 12}), 409, "too_many_orbits")
-    assert MODEL in found["detail"]
+    refusal = problem(app.http.post(ORBITS, json=WISH | {"fps": 12}), 409, "too_many_orbits")
+    assert MODEL in refusal["detail"]
     without = serve(storage=app.settings.storage)
     problem(without.http.post(ORBITS, json=WISH), 503, "renderer_unavailable")
 
@@ -265,7 +265,7 @@ def test_a_broken_record_hides_no_other(app: ServedApp) -> None:
     made = KEPT.ended(app, KEPT.begun(app)["id"])
     broken = {"id": "0" * 16, "model": MODEL, "state": "later"}
     app.service.storage.put(layout.kept_record(MODEL, "orbits", "0" * 16), json.dumps(broken).encode())
-    assert [found["id"] for found in app.http.get(ORBITS).json()["orbits"]] == [made["id"]]
+    assert [orbit["id"] for orbit in app.http.get(ORBITS).json()["orbits"]] == [made["id"]]
 
 
 def test_the_sdk_waits_with_progress_and_renders_nothing_twice(
@@ -320,7 +320,7 @@ def test_the_command_shows_progress_and_an_interrupt_cancels_the_video(
         command.send_signal(signal.SIGINT)
         assert command.wait(20) == 130
         command.communicate()
-        assert [found["frames"] for found in app.http.get(ORBITS).json()["orbits"]] == [10]
+        assert [orbit["frames"] for orbit in app.http.get(ORBITS).json()["orbits"]] == [10]
         wait_for(lambda: not app.service.orbits.unfinished.running)
     finally:
         renderer.send_signal(signal.SIGCONT)

@@ -247,8 +247,8 @@ def test_two_reapers_at_once_requeue_an_attempt_once(app: ServedApp, quick_lease
     lease = take(app.redis)
     app.redis.zadd(rq_keys.STARTED, {lease.member: 1})
     with ThreadPoolExecutor(4) as pool:
-        found = list(pool.map(lambda _: leases.Reclaim(app.redis).run(), range(8)))
-    assert [became for runs in found for _, became in runs] == ["waiting"]
+        results = list(pool.map(lambda _: leases.Reclaim(app.redis).run(), range(8)))
+    assert [became for runs in results for _, became in runs] == ["waiting"]
     assert waiting(app.redis) == 1
 
 

@@ -12,14 +12,14 @@ from splatmill.backplane.storage import layout
 from splatmill.schema import CreateWebhook, Job
 from splatmill_server.background import deliveries
 from tests.support.served_app import Serve, ServedApp, stored
-from tests.support.servers.scripted_server import Reply, ScriptedServer, Seen, scripted_server
+from tests.support.servers.scripted_server import Reply, Request, ScriptedServer, scripted_server
 from tests.support.waiting import wait_for
 
 
 @pytest.fixture
 def peer() -> Iterator[ScriptedServer]:
-    async def answer(seen: Seen) -> Reply:
-        if seen.path == "/hangs":
+    async def answer(request: Request) -> Reply:
+        if request.path == "/hangs":
             return Reply(body=b"x" * 5000, pace=0.05)
         return Reply(body=b"thanks")
 
@@ -49,8 +49,8 @@ def ended(app: ServedApp, owner: str) -> None:
 
 
 def states(app: ServedApp, webhook_id: str) -> list[Any]:
-    found = app.http.get(f"/v1/webhooks/{webhook_id}/deliveries").json()["deliveries"]
-    return [delivery["state"] for delivery in found]
+    log = app.http.get(f"/v1/webhooks/{webhook_id}/deliveries").json()["deliveries"]
+    return [delivery["state"] for delivery in log]
 
 
 def test_receivers_of_one_owner_that_hang_do_not_hold_up_another_owner(
@@ -60,16 +60,16 @@ def test_receivers_of_one_owner_that_hang_do_not_hold_up_another_owner(
         webhook(app, f"{peer.url}/hangs", "ann")
     good = webhook(app, f"{peer.url}/good", "bob")
     ended(app, "ann")
-    wait_for(lambda: len(peer.seen) >= 4)
+    wait_for(lambda: len(peer.requests) >= 4)
     ended(app, "bob")
     wait_for(lambda: states(app, good) == ["delivered"], 10)
-    assert len([seen for seen in peer.seen if seen.path == "/hangs"]) == 4
+    assert len([request for request in peer.requests if request.path == "/hangs"]) == 4
 
 
 def test_the_deletion_of_a_webhook_ends_its_attempts_at_once(app: ServedApp, peer: ScriptedServer) -> None:
     made = webhook(app, f"{peer.url}/hangs", "ann")
     ended(app, "ann")
-    wait_for(lambda: len(peer.seen) == 1)
+    wait_for(lambda: len(peer.requests) == 1)
     assert app.http.delete(f"/v1/webhooks/{made}").status_code == 204
     wait_for(lambda: peer.left == 1, 5)
     wait_for(lambda: not any(path.startswith(("webhooks", "due")) for path in stored(app)), 5)

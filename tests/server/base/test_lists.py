@@ -50,35 +50,35 @@ Page = Callable[[str | None], tuple[list[str], str | None]]
 
 def all_pages(page: Page) -> tuple[list[str], int]:
     """The ids on all pages, in order, and the number of pages."""
-    found, cursor, count = [], None, 0
+    all_ids, cursor, count = [], None, 0
     while True:
         ids, cursor = page(cursor)
-        found += ids
+        all_ids += ids
         count += 1
         if cursor is None:
-            return found, count
+            return all_ids, count
 
 
-def jobs(service: Service, wanted: JobFilter | None = None) -> Page:
+def jobs(service: Service, only: JobFilter | None = None) -> Page:
     def page(cursor: str | None) -> tuple[list[str], str | None]:
-        found = service.jobs.list(cursor, PAGE, wanted)
-        return [job.id for job in found.jobs], found.cursor
+        listing = service.jobs.list(cursor, PAGE, only)
+        return [job.id for job in listing.jobs], listing.cursor
 
     return page
 
 
-def captures(service: Service, wanted: Filter | None = None) -> Page:
+def captures(service: Service, only: Filter | None = None) -> Page:
     def page(cursor: str | None) -> tuple[list[str], str | None]:
-        found = service.captures.list(cursor, PAGE, wanted)
-        return [capture.id for capture in found.captures], found.cursor
+        listing = service.captures.list(cursor, PAGE, only)
+        return [capture.id for capture in listing.captures], listing.cursor
 
     return page
 
 
-def models(service: Service, wanted: Filter | None = None) -> Page:
+def models(service: Service, only: Filter | None = None) -> Page:
     def page(cursor: str | None) -> tuple[list[str], str | None]:
-        found = service.models.list(cursor, PAGE, wanted)
-        return [model.id for model in found.models], found.cursor
+        listing = service.models.list(cursor, PAGE, only)
+        return [model.id for model in listing.models], listing.cursor
 
     return page
 
@@ -96,8 +96,8 @@ def test_the_pages_hold_every_record_once_newest_first(seeded: tuple[Service, Se
         name for name in mine if name in records.succeeded
     ]
     for state, ids in (("queued", records.queued), ("failed", records.failed)):
-        wanted = JobFilter(states=frozenset({JobState(state)}))
-        assert all_pages(jobs(service, wanted))[0] == sorted(ids, reverse=True)
+        only = JobFilter(states=frozenset({JobState(state)}))
+        assert all_pages(jobs(service, only))[0] == sorted(ids, reverse=True)
     assert all_pages(jobs(service, JobFilter(capture=newest[7])))[0] == [newest[7]]
     assert all_pages(captures(service, Filter(name="scene 11")))[0] == [
         f"{number:016x}" for number in (119, 118, 117, 116, 115, 114, 113, 112, 111, 110, 11)
@@ -179,11 +179,11 @@ def test_a_new_record_is_on_the_first_page_at_once_and_a_deleted_one_is_not(
     service, _ = seeded
     service.lists.ensure(0.0)
     made, _ = service.captures.create("new", owner="owner3")
-    for wanted in (Filter(), Filter(owner="owner3"), Filter(name="NEW")):
-        assert captures(service, wanted)(None)[0][0] == made.id
+    for only in (Filter(), Filter(owner="owner3"), Filter(name="NEW")):
+        assert captures(service, only)(None)[0][0] == made.id
     service.captures.delete(made.id)
-    for wanted in (Filter(), Filter(owner="owner3")):
-        assert captures(service, wanted)(None)[0][0] != made.id
+    for only in (Filter(), Filter(owner="owner3")):
+        assert captures(service, only)(None)[0][0] != made.id
     assert service.redis.zscore(lists.name("captures"), made.id) is None
     assert not service.redis.hexists(keys.records("captures"), made.id)
 

@@ -51,16 +51,16 @@ def test_ends_are_counted_once_by_whichever_process_sees_them_first(serve: Serve
         for app in (first, second):
             app.service.reaper.tick()
     for app in (first, second):
-        found = scraped(app)
+        samples = scraped(app)
         counts = {
             name[1]: value
-            for name, value in found.items()
+            for name, value in samples.items()
             if name[0] == "splatmill_jobs_ended_total" and value
         }
         assert counts == {("diverged", "failed"): 1, ("", "succeeded"): 1, ("", "cancelled"): 1}
-        assert found["splatmill_job_seconds_count", ("succeeded",)] == 1
-        assert found["splatmill_jobs_unfinished", ()] == 0
-        assert found["splatmill_records", ("jobs",)] == 3
+        assert samples["splatmill_job_seconds_count", ("succeeded",)] == 1
+        assert samples["splatmill_jobs_unfinished", ()] == 0
+        assert samples["splatmill_records", ("jobs",)] == 3
 
 
 def test_an_end_that_no_reaper_has_seen_is_counted_by_what_comes_next(app: ServedApp) -> None:
@@ -80,9 +80,9 @@ def test_a_redis_that_comes_back_empty_counts_on_from_zero_and_nothing_twice(app
     app.service.reaper.tick()
     app.redis.flushall()
     app.service.reaper.tick()
-    found = scraped(app)
-    assert not any(value for (name, _), value in found.items() if name == "splatmill_jobs_ended_total")
-    assert found["splatmill_records", ("jobs",)] == 2
+    samples = scraped(app)
+    assert not any(value for (name, _), value in samples.items() if name == "splatmill_jobs_ended_total")
+    assert samples["splatmill_records", ("jobs",)] == 2
     fail(app, later)
     app.service.reaper.tick()
     assert scraped(app)["splatmill_jobs_ended_total", ("diverged", "failed")] == 1
@@ -92,20 +92,20 @@ def test_a_wait_is_counted_when_it_ends_and_the_longest_one_is_shown(app: Served
     app.job(), app.job()
     for entry in cast(list[bytes], app.redis.zrange(keys.ARRIVED, 0, -1)):
         app.redis.zincrby(keys.ARRIVED, -90, entry)
-    found = scraped(app)
-    assert 90 <= found["splatmill_queue_oldest_seconds", ()] < 120
-    assert ("splatmill_queue_wait_seconds_count", ("any",)) not in found
+    samples = scraped(app)
+    assert 90 <= samples["splatmill_queue_oldest_seconds", ()] < 120
+    assert ("splatmill_queue_wait_seconds_count", ("any",)) not in samples
     lease = take(app.redis)
     take(app.redis)
-    found = scraped(app)
-    assert found["splatmill_queue_oldest_seconds", ()] == 0
+    samples = scraped(app)
+    assert samples["splatmill_queue_oldest_seconds", ()] == 0
     waits = {
         labels[0]: value
-        for (name, labels), value in found.items()
+        for (name, labels), value in samples.items()
         if name == "splatmill_queue_wait_seconds_bucket"
     }
     assert [waits[bound] for bound in ("60.0", "120.0", "+Inf")] == [0, 2, 2]
-    assert 180 <= found["splatmill_queue_wait_seconds_sum", ("any",)] < 240
+    assert 180 <= samples["splatmill_queue_wait_seconds_sum", ("any",)] < 240
     assert lines.hand_back(app.redis, lease)
     take(app.redis)
     again = scraped(app)
@@ -126,9 +126,9 @@ def test_a_lost_worker_is_counted_with_its_entry(app: ServedApp) -> None:
     app.job()
     for _ in range(leases.MAX_LOST):
         assert leases.requeue(app.redis, take(app.redis), if_expired=False) != "kept"
-    found = scraped(app)
-    assert found["splatmill_workers_lost_total", ("waiting",)] == leases.MAX_LOST - 1
-    assert found["splatmill_workers_lost_total", ("failed",)] == 1
+    samples = scraped(app)
+    assert samples["splatmill_workers_lost_total", ("waiting",)] == leases.MAX_LOST - 1
+    assert samples["splatmill_workers_lost_total", ("failed",)] == 1
 
 
 def test_the_workers_are_told_in_sum_and_not_one_by_one(app: ServedApp) -> None:
@@ -140,11 +140,11 @@ def test_the_workers_are_told_in_sum_and_not_one_by_one(app: ServedApp) -> None:
             {"state": state, "last_heartbeat": beat} | workers.served(("any",)) | workers.spare(spare)
         )
         app.redis.hset(f"rq:worker:{name}", mapping=record)
-    found = scraped(app)
-    assert [found["splatmill_workers", (state,)] for state in ("idle", "busy", "suspended")] == [1, 2, 0]
-    assert 39 <= found["splatmill_worker_heartbeat_age_seconds", ()] < 60
-    assert found["splatmill_worker_disk_spare_bytes", ()] == -5
-    assert found["splatmill_queue_workers", ("any",)] == 3
+    samples = scraped(app)
+    assert [samples["splatmill_workers", (state,)] for state in ("idle", "busy", "suspended")] == [1, 2, 0]
+    assert 39 <= samples["splatmill_worker_heartbeat_age_seconds", ()] < 60
+    assert samples["splatmill_worker_disk_spare_bytes", ()] == -5
+    assert samples["splatmill_queue_workers", ("any",)] == 3
 
 
 def test_a_scrape_costs_no_more_with_more_records(app: ServedApp) -> None:
@@ -171,25 +171,25 @@ def test_a_scrape_costs_no_more_with_more_records(app: ServedApp) -> None:
 
 
 def test_without_redis_there_is_no_value_rather_than_an_old_one() -> None:
-    found = {
+    samples = {
         (sample.name, *sample.labels.values()): sample.value
         for family in families(None)
         for sample in family.samples
     }
-    assert found == {("splatmill_redis_up",): 0}
+    assert samples == {("splatmill_redis_up",): 0}
 
 
 def test_uploads_and_storage_are_counted_with_their_errors(
     app: ServedApp, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     app.capture("a.jpg", "b.jpg", "c.jpg")
-    found = scraped(app)
-    assert found["splatmill_uploaded_files_total", ()] == 3
-    assert found["splatmill_uploaded_bytes_total", ()] == 3 * len(b"\xff\xd8\xff photo 0")
-    writes = found["splatmill_storage_operations_total", ("write", "ok")]
+    samples = scraped(app)
+    assert samples["splatmill_uploaded_files_total", ()] == 3
+    assert samples["splatmill_uploaded_bytes_total", ()] == 3 * len(b"\xff\xd8\xff photo 0")
+    writes = samples["splatmill_storage_operations_total", ("write", "ok")]
     assert writes > 3
-    assert found["splatmill_storage_seconds_count", ("write",)] == writes
-    assert found["splatmill_storage_spare_bytes", ()] > 0
+    assert samples["splatmill_storage_seconds_count", ("write",)] == writes
+    assert samples["splatmill_storage_spare_bytes", ()] > 0
     root = app.service.storage.root
     assert root is not None
     (root / "captures" / ("f" * 16)).write_text("a file where a folder would have to be")
@@ -215,11 +215,11 @@ def test_the_end_of_an_attempt_is_where_its_stage_ends() -> None:
         said(502, 2, JobState.training),
         said(602, 2, JobState.exporting),
     ]
-    found = JobRow(
+    job_row = JobRow(
         id="a" * 16, capture="b" * 16, options=TrainOptions(), created_at=began, queued_at=began, generation=1
     )
-    assert outcome.increments(found, states) == {}, "it has not ended"
-    cancelled = found.model_copy(
+    assert outcome.increments(job_row, states) == {}, "it has not ended"
+    cancelled = job_row.model_copy(
         update={"verdict": Verdict(state="cancelled", at=began + timedelta(seconds=605), after=states[-1].id)}
     )
     spent = outcome.stage_seconds(cancelled, states)
@@ -230,9 +230,9 @@ def test_the_end_of_an_attempt_is_where_its_stage_ends() -> None:
 
 
 def test_every_metric_says_how_processes_are_put_together() -> None:
-    found = [*Metrics().registry.collect(), *families(None), *of_disk(1), *of_renderer(None)]
-    assert len({family.name for family in found}) == len(found) > 30
-    for family in found:
+    all_families = [*Metrics().registry.collect(), *families(None), *of_disk(1), *of_renderer(None)]
+    assert len({family.name for family in all_families}) == len(all_families) > 30
+    for family in all_families:
         assert family.documentation.endswith((OF_PROCESS, SAME, SMALLEST)), family.name
         assert family.name.startswith("splatmill_")
 
@@ -246,9 +246,9 @@ def test_a_hash_of_another_version_is_read_as_far_as_it_is_known() -> None:
         b"splatmill_stage_seconds|sfm|3": b"4",
         b"splatmill_stage_seconds|sfm|sum": b"31.5",
     }
-    found = totals.read(stored)
-    assert found["splatmill_jobs_ended"].values == {("failed", "diverged"): 2}
-    distribution = found["splatmill_stage_seconds"].distributions["sfm",]
+    metrics = totals.read(stored)
+    assert metrics["splatmill_jobs_ended"].values == {("failed", "diverged"): 2}
+    distribution = metrics["splatmill_stage_seconds"].distributions["sfm",]
     assert (distribution.counts[3], sum(distribution.counts), distribution.sum) == (4, 4, 31.5)
 
 
@@ -272,7 +272,7 @@ def test_a_code_and_a_state_that_nobody_knows_count_as_other(app: ServedApp) -> 
     app.service.reaper.tick()
     app.redis.sadd("rq:workers", "rq:worker:a")
     app.redis.hset("rq:worker:a", mapping={"state": "made up", "last_heartbeat": "x"})
-    found = scraped(app)
-    assert found["splatmill_jobs_ended_total", ("other", "failed")] == 1
-    assert found["splatmill_workers", ("other",)] == 1
+    samples = scraped(app)
+    assert samples["splatmill_jobs_ended_total", ("other", "failed")] == 1
+    assert samples["splatmill_workers", ("other",)] == 1
     assert not re.search("made[ _]up", app.http.get("/metrics").text)

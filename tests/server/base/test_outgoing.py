@@ -53,7 +53,7 @@ def names(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[str]]:
         except ValueError:
             if name not in known:
                 raise socket.gaierror(socket.EAI_NONAME, "unknown") from None
-            return [found for address in known[name] for found in real(address, port, *rest, **more)]
+            return [entry for address in known[name] for entry in real(address, port, *rest, **more)]
         return real(host, port, *rest, **more)
 
     monkeypatch.setattr(socket, "getaddrinfo", resolve)
@@ -174,9 +174,9 @@ def test_the_connection_goes_to_the_checked_address_and_names_the_host(
     outgoing = Outgoing(f"other.example, PINNED.example:{port_of(peer)}")
     answer, body = fetch(outgoing, f"http://pinned.example:{port_of(peer)}/a%20b?c=d#e")
     assert (answer.status, answer.headers["x-kind"], answer.size, body) == (200, "a", 4, b"here")
-    assert peer.seen[0].path == "/a%20b?c=d"
-    assert peer.seen[0].headers["host"] == f"pinned.example:{port_of(peer)}"
-    assert peer.seen[0].headers["accept-encoding"] == "identity"
+    assert peer.requests[0].path == "/a%20b?c=d"
+    assert peer.requests[0].headers["host"] == f"pinned.example:{port_of(peer)}"
+    assert peer.requests[0].headers["accept-encoding"] == "identity"
     # The name was resolved once; a second answer of the resolver would have had no effect.
     assert names[""].count("pinned.example") == 1
 
@@ -188,9 +188,11 @@ def test_redirects_are_followed_a_few_times_and_checked_each_time(
     names["localhost"] = ["127.0.0.1"]
     outgoing = Outgoing(f"127.0.0.1:{port}")
 
-    def answer(seen: Any) -> Reply:
-        target = seen.path.removeprefix("/to/")
-        return Reply(status=302, headers={"Location": target}) if target != seen.path else Reply(body=b"end")
+    def answer(request: Any) -> Reply:
+        target = request.path.removeprefix("/to/")
+        return (
+            Reply(status=302, headers={"Location": target}) if target != request.path else Reply(body=b"end")
+        )
 
     peer.answer = answer
     assert fetch(outgoing, f"{peer.url}/to//end", redirects=5)[1] == b"end"
@@ -286,8 +288,8 @@ def test_tls_checks_the_certificate_against_the_name(
 
 
 def test_the_allowed_hosts_are_names_with_or_without_a_port() -> None:
-    found = allowed_hosts("a.example, B.example:8000 ,[::1]:80,10.0.0.1")
-    assert found == {("a.example", None), ("b.example", 8000), ("::1", 80), ("10.0.0.1", None)}
+    hosts = allowed_hosts("a.example, B.example:8000 ,[::1]:80,10.0.0.1")
+    assert hosts == {("a.example", None), ("b.example", 8000), ("::1", 80), ("10.0.0.1", None)}
     for wrong in ("http://a.example", "a.example/path", "u@a.example"):
         with pytest.raises(ValueError, match="is not a host"):
             allowed_hosts(wrong)
@@ -311,7 +313,7 @@ def test_a_redirect_to_such_an_address_is_refused(peer: ScriptedServer, location
     outgoing = Outgoing(allow=peer.url.removeprefix("http://"))
     with pytest.raises((AddressRefused, NoAnswer)):
         fetch(outgoing, peer.url, redirects=5)
-    assert len(peer.seen) == 1
+    assert len(peer.requests) == 1
 
 
 def test_an_announced_size_of_many_digits_is_an_error_of_the_other_server(peer: ScriptedServer) -> None:

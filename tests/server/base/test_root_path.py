@@ -66,13 +66,13 @@ def published(app: ServedApp, **proxy: Any) -> Iterator[httpx.Client]:
             yield http
 
 
-def texts(found: Any) -> list[str]:
+def texts(node: Any) -> list[str]:
     """All texts in a JSON document but those of the OpenAPI document, whose paths are below its `servers`."""
-    if isinstance(found, dict):
-        return [] if "openapi" in found else [text for value in found.values() for text in texts(value)]
-    if isinstance(found, list):
-        return [text for value in found for text in texts(value)]
-    return [found] if isinstance(found, str) else []
+    if isinstance(node, dict):
+        return [] if "openapi" in node else [text for value in node.values() for text in texts(value)]
+    if isinstance(node, list):
+        return [text for value in node for text in texts(value)]
+    return [node] if isinstance(node, str) else []
 
 
 def followed(http: httpx.Client, answer: httpx.Response, address: str) -> httpx.Response:
@@ -159,10 +159,10 @@ def test_a_page_finds_its_files_below_any_path(serve: Serve, settings: dict[str,
         named += [address for text in mapped for address in json.loads(text)["imports"].values()]
         assert len(named) >= 4
         for address in named:
-            found = urljoin(str(page.url), address)
-            assert found.startswith(str(http.base_url))
-            if not found.endswith("/") or found == str(http.base_url):  # a map names folders, too
-                assert http.get(found).status_code == 200, address
+            url = urljoin(str(page.url), address)
+            assert url.startswith(str(http.base_url))
+            if not url.endswith("/") or url == str(http.base_url):  # a map names folders, too
+                assert http.get(url).status_code == 200, address
 
 
 def test_a_path_named_by_a_stranger_is_not_believed(serve: Serve) -> None:

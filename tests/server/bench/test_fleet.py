@@ -22,9 +22,9 @@ def test_every_row_is_measured_and_written(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr("_fleet.api.LOOK_SECONDS", 0.2)
     (tmp_path / "redis").mkdir()
     with empty_redis(tmp_path / "redis") as url:
-        found = list(fleet.measure(tmp_path, url, workers=3, jobs=6, seconds=2.0))
-    start, idle, rate, training = found
-    assert [row["what"] for row in found] == ["start", "idle", "rate", "training"]
+        rows = list(fleet.measure(tmp_path, url, workers=3, jobs=6, seconds=2.0))
+    start, idle, rate, training = rows
+    assert [row["what"] for row in rows] == ["start", "idle", "rate", "training"]
     assert 1 <= start["connections"] <= 2  # the second one listens for commands, and comes a moment later
     assert idle["events"] == 0
     assert rate["jobs"] == 6
@@ -34,7 +34,7 @@ def test_every_row_is_measured_and_written(tmp_path: Path, monkeypatch: pytest.M
     assert 0 < training["events"] < training["round_trips"]
     assert training["page"]["found"] == 3
     origin = {"commit": "c", "machine": "m", "versions": {"python": "3"}}
-    for row in found:
+    for row in rows:
         append(tmp_path / "fleet.jsonl", {**row, **origin})
     append(tmp_path / "capacity.jsonl", {"records": 100, "what": "memory", "bytes": 780_000, **origin})
     assert "| 3 | 6 | " in fleet.STUDY.page(lines(tmp_path / "fleet.jsonl"))

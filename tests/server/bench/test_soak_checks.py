@@ -158,10 +158,10 @@ class Ended:
         return self.app.redis
 
     def listed(self) -> dict[str, list[str]]:
-        found = {}
+        ids = {}
         for kind in ("captures", "jobs", "models"):
-            found[kind] = [one["id"] for one in self.app.http.get(f"/v1/{kind}").json()[kind]]
-        return found
+            ids[kind] = [one["id"] for one in self.app.http.get(f"/v1/{kind}").json()[kind]]
+        return ids
 
     def differences(self) -> list[str]:
         return agreement.compare(self.redis, self.storage, self.listed(), [self.capture])
@@ -179,19 +179,19 @@ def ended(serve: Serve) -> Ended:
     app.begin(job)
     app.finish(job)
     app.http.post(f"/v1/jobs/{cancelled}/cancel")
-    found = Ended(app, capture, job, cancelled)
-    found.change(layout.job_record(job), capture=capture, generation=1)
+    service = Ended(app, capture, job, cancelled)
+    service.change(layout.job_record(job), capture=capture, generation=1)
     app.service.reaper.tick()
     queue.withdraw(app.redis, job, 1)  # no worker has taken the entry of the one that has succeeded
-    return found
+    return service
 
 
 @pytest.fixture
 def clients(ended: Ended) -> Iterator[Clients]:
     """Clients of it that look when they are told to."""
-    found = Clients(cast(Any, ended.app), seed=0)
-    yield found
-    found._http.close()
+    users = Clients(cast(Any, ended.app), seed=0)
+    yield users
+    users._http.close()
 
 
 def test_a_service_at_rest_agrees(ended: Ended) -> None:
@@ -248,8 +248,8 @@ PLANTED: dict[str, tuple[Callable[[Ended], Any], str]] = {
 def test_a_difference_between_redis_and_storage_is_found(ended: Ended, planted: str) -> None:
     plant, named = PLANTED[planted]
     plant(ended)
-    found = ended.differences()
-    assert any(named in sentence for sentence in found), found
+    differences = ended.differences()
+    assert any(named in sentence for sentence in differences), differences
 
 
 def test_a_list_that_tells_twice_or_not_at_all_is_found(ended: Ended) -> None:
@@ -324,9 +324,9 @@ SPOILED: dict[str, tuple[Callable[[Ended], Any], str]] = {
 def test_a_file_that_is_not_whole_or_not_explained_is_found(ended: Ended, spoiled: str) -> None:
     plant, named = SPOILED[spoiled]
     plant(ended)
-    found = files.strays(ended.storage)
-    assert found
-    assert any(named in sentence for sentence in found), found
+    strays = files.strays(ended.storage)
+    assert strays
+    assert any(named in sentence for sentence in strays), strays
 
 
 def test_the_preview_of_a_job_that_has_no_model_is_explained(ended: Ended) -> None:
@@ -456,8 +456,8 @@ def test_a_job_that_is_cancelled_unasked_or_forgotten_is_lost(ended: Ended, clie
         clients._look(promise)
         assert promise.failure is not None
         clients.promises[promise.job] = promise
-    found = verdict.lost(clients, [ended.job], [ended.job, OTHER])
-    assert [f"{ended.cancelled} failed", f"{OTHER} failed"] == [one.partition(":")[0] for one in found]
+    sentences = verdict.lost(clients, [ended.job], [ended.job, OTHER])
+    assert [f"{ended.cancelled} failed", f"{OTHER} failed"] == [one.partition(":")[0] for one in sentences]
 
 
 def test_a_job_or_model_that_is_not_listed_is_lost(ended: Ended, clients: Clients) -> None:

@@ -70,11 +70,11 @@ def test_what_a_part_has_started_is_named_with_that_part() -> None:
 
 @pytest.fixture
 def adoption() -> Iterator[Adoption]:
-    found = Adoption()
-    if found.missing is not None:
-        pytest.skip(found.missing)
-    yield found
-    found.end()
+    parent = Adoption()
+    if parent.missing is not None:
+        pytest.skip(parent.missing)
+    yield parent
+    parent.end()
 
 
 def test_every_process_below_is_found_and_keeps_its_role_without_a_parent(adoption: Adoption) -> None:
@@ -144,9 +144,9 @@ def fake(monkeypatch: pytest.MonkeyPatch) -> Iterator[Fake]:
     monkeypatch.setattr(target, "_RARE_SECONDS", 0.0)
     monkeypatch.setattr(target, "_VICTIM_SECONDS", 0.0)
     monkeypatch.setattr(target, "_DELAY", (0.0, 0.0))
-    found = Fake(("supervisor",), WORKER, TRAINER, (*TRAINER, "decoder"), ("supervisor", "API"))
-    yield found
-    found.close()
+    service = Fake(("supervisor",), WORKER, TRAINER, (*TRAINER, "decoder"), ("supervisor", "API"))
+    yield service
+    service.close()
 
 
 def test_each_role_is_killed_as_often_as_the_others_and_spared_by_rule(fake: Fake) -> None:

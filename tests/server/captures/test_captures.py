@@ -48,16 +48,16 @@ def test_a_capture_is_made_listed_read_and_deleted(app: ServedApp) -> None:
 
 def test_pages_of_captures_hold_each_once_newest_first(app: ServedApp) -> None:
     made = [app.http.post("/v1/captures", json={}).json() for _ in range(5)]
-    seen, cursor = [], None
+    ids, cursor = [], None
     while True:
         params = {"limit": "2"} | ({"cursor": cursor} if cursor else {})
         page = app.http.get("/v1/captures", params=params).json()
-        seen += [capture["id"] for capture in page["captures"]]
+        ids += [capture["id"] for capture in page["captures"]]
         cursor = page["cursor"]
         if cursor is None:
             break
     newest = sorted(made, key=lambda c: (int(_ms(c["created_at"])), c["id"]), reverse=True)
-    assert seen == [capture["id"] for capture in newest]
+    assert ids == [capture["id"] for capture in newest]
     problem(app.http.get("/v1/captures?cursor=nonsense"), 422, "cursor_invalid")
 
 
@@ -269,9 +269,9 @@ def test_every_error_of_an_upload_names_its_file(serve: Serve, tmp_path: Path) -
     wrong = {"X-Content-SHA256": "0" * 64}
 
     def named(answer: httpx.Response, status: int, code: str, name: str) -> None:
-        found = problem(answer, status, code)
-        assert name in found["detail"]
-        assert found["facts"]["file"] == name
+        refusal = problem(answer, status, code)
+        assert name in refusal["detail"]
+        assert refusal["facts"]["file"] == name
 
     named(app.http.put(address, content=b"other"), 409, "name_taken", "images/sub/a.jpg")
     empty = address.replace("images/sub/a.jpg", "poses/images.txt")

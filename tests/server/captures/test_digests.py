@@ -62,8 +62,8 @@ def look(app: ServedApp, capture_id: str) -> dict[str, str]:
 
 def of(s3: FaultyS3, capture_id: str) -> list[Request]:
     """The requests about a capture since the last call."""
-    seen, s3.seen = s3.seen, []
-    return [request for request in seen if capture_id in request.path]
+    requests, s3.requests = s3.requests, []
+    return [request for request in requests if capture_id in request.path]
 
 
 EXPECTED = {f"{number:03}.jpg": hashlib.sha256(photo(number)).hexdigest() for number in range(PHOTOS)}
@@ -80,8 +80,8 @@ def test_an_upload_costs_three_operations_and_a_look_four_at_most(s3: FaultyS3, 
     operations = of(s3, capture_id)
     # Each: the digest that claims the name, the bytes, and whether the capture is still there. The record is read anew
     # every five seconds.
-    wanted = [request for request in operations if request.method in ("PUT", "HEAD")]
-    assert len(wanted) == 3 * PHOTOS
+    steps = [request for request in operations if request.method in ("PUT", "HEAD")]
+    assert len(steps) == 3 * PHOTOS
     assert len(operations) <= 3 * PHOTOS + 3
     assert len(look(app, capture_id)) == PHOTOS + 1
     first = of(s3, capture_id)

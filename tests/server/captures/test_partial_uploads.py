@@ -133,9 +133,9 @@ def test_a_file_arrives_in_pieces_and_is_checked_as_a_whole(app: ServedApp) -> N
     head = app.http.head(address).headers
     assert (head["upload-offset"], head["upload-complete"]) == (str(len(DATA)), "?1")
     problem(append(app, address, 1_000_007, DATA[1_000_007:], complete=True), 409, "upload_completed")
-    found = begin(app, capture_id)
-    assert (found.status_code, found.json()) == (200, last.json())
-    assert found.headers["upload-complete"] == "?1"
+    repeat = begin(app, capture_id)
+    assert (repeat.status_code, repeat.json()) == (200, last.json())
+    assert repeat.headers["upload-complete"] == "?1"
 
 
 def test_a_body_that_breaks_off_is_kept_as_far_as_it_came(app: ServedApp) -> None:

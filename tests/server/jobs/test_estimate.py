@@ -48,8 +48,8 @@ def job(**changes: Any) -> Figures:
 
 
 def seconds(request: dict[str, Any], *finished: Figures) -> list[float | None]:
-    found = estimate(EstimateJob.model_validate(request), finished)
-    return [stage.seconds for stage in found.stages]
+    result = estimate(EstimateJob.model_validate(request), finished)
+    return [stage.seconds for stage in result.stages]
 
 
 def test_stages_are_scaled_by_photos_and_steps() -> None:
@@ -174,14 +174,14 @@ def test_only_the_share_of_a_step_that_pixels_take_grows_with_them() -> None:
 def test_the_jobs_that_are_most_alike_decide_and_give_a_range() -> None:
     small = [job(photos=20, cameras=seconds) for seconds in (8.0, 9.0, 10.0, 11.0, 14.0)]
     large = [job(photos=400, cameras=4000.0)] * 3
-    found = estimate(EstimateJob(photos=20), [*large, *small])
-    cameras = found.stages[0]
+    result = estimate(EstimateJob(photos=20), [*large, *small])
+    cameras = result.stages[0]
     assert (cameras.lowest, cameras.seconds, cameras.highest) == (8.0, 10.0, 14.0)
-    assert found.jobs == 8
-    assert found.seconds == sum(stage.seconds or 0.0 for stage in found.stages)
-    assert found.lowest is not None
-    assert found.highest is not None
-    assert found.lowest < found.seconds < found.highest
+    assert result.jobs == 8
+    assert result.seconds == sum(stage.seconds or 0.0 for stage in result.stages)
+    assert result.lowest is not None
+    assert result.highest is not None
+    assert result.lowest < result.seconds < result.highest
     assert "0.5 s per photo" in cameras.because
     assert seconds({"photos": 400}, *large, *small)[0] == 4000.0
 
@@ -193,16 +193,16 @@ def test_other_machines_kernels_and_kinds_of_cameras_do_not_count() -> None:
     gpu = job(kernels="gpu", machine="a card", train=3.0)
     assert seconds({"photos": 20, "options": {"backend": "gpu"}}, job(), gpu)[1] == 3.0
     assert seconds({"photos": 20, "options": {"backend": "cpu"}}, gpu, job())[1] == 60.0
-    found = estimate(EstimateJob(photos=20, posed=True), [job()])
-    assert found.stages[0].seconds is None
-    assert found.seconds is None  # no sum without one of its parts
-    assert "came with the photos" in found.stages[0].because
+    result = estimate(EstimateJob(photos=20, posed=True), [job()])
+    assert result.stages[0].seconds is None
+    assert result.seconds is None  # no sum without one of its parts
+    assert "came with the photos" in result.stages[0].because
     assert seconds({"photos": 20, "posed": True}, job(), job(posed=True, cameras=1.0))[0] == 1.0
 
 
 def test_nothing_is_made_up_without_history() -> None:
-    found = estimate(EstimateJob(photos=20), [])
-    assert found.model_dump(include={"seconds", "lowest", "highest", "jobs", "machine"}) == {
+    result = estimate(EstimateJob(photos=20), [])
+    assert result.model_dump(include={"seconds", "lowest", "highest", "jobs", "machine"}) == {
         "seconds": None,
         "lowest": None,
         "highest": None,
@@ -210,27 +210,27 @@ def test_nothing_is_made_up_without_history() -> None:
         "machine": None,
     }
     assert all(
-        stage.seconds is None and "finished on this server yet" in stage.because for stage in found.stages
+        stage.seconds is None and "finished on this server yet" in stage.because for stage in result.stages
     )
 
 
 def test_figures_are_read_from_the_records_of_a_real_job() -> None:
     stored, report = records()
-    found = figures(stored, report)
-    assert found is not None
-    assert (found.photos, found.posed, found.steps, found.image_size, found.kernels) == (
+    numbers = figures(stored, report)
+    assert numbers is not None
+    assert (numbers.photos, numbers.posed, numbers.steps, numbers.image_size, numbers.kernels) == (
         8,
         True,
         60,
         64,
         "cpu",
     )
-    assert found.machine == "AMD EPYC, 2 cores"
-    assert found.train == pytest.approx(0.1211, abs=1e-4)
+    assert numbers.machine == "AMD EPYC, 2 cores"
+    assert numbers.train == pytest.approx(0.1211, abs=1e-4)
     # All of its 17.40 s are accounted for.
-    wall = found.cameras + found.train + found.by_photo + found.fixed
+    wall = numbers.cameras + numbers.train + numbers.by_photo + numbers.fixed
     assert wall == pytest.approx(17.4024, abs=1e-3)
-    assert 0.0 < found.pixel_share < 1.0
+    assert 0.0 < numbers.pixel_share < 1.0
     assert figures({**stored, "attempt": 2}, report) is None
     assert figures(stored, {**report, "edit": {"model": "before"}}) is None, (
         "an edit has the report of its training"
@@ -240,9 +240,9 @@ def test_figures_are_read_from_the_records_of_a_real_job() -> None:
 def test_cameras_that_an_earlier_job_recovered_count_with_the_time_that_took() -> None:
     stored, report = records()
     report["sfm"] = {"seconds": {"features": 20.0, "matching": 10.5}}
-    found = figures(stored, {**report, "facts": report["facts"] | {"source": "sfm"}})
-    assert found is not None
-    assert (found.cameras, found.posed) == (30.5, False)
+    numbers = figures(stored, {**report, "facts": report["facts"] | {"source": "sfm"}})
+    assert numbers is not None
+    assert (numbers.cameras, numbers.posed) == (30.5, False)
 
 
 def test_the_endpoint_estimates_from_stored_models_and_creates_nothing(app: ServedApp) -> None:
@@ -255,11 +255,11 @@ def test_the_endpoint_estimates_from_stored_models_and_creates_nothing(app: Serv
     app.service.storage.put(layout.job_record(broken), b'{"attempt": 1}')
     for model_id in (STORED.name, broken):
         lists.add_model(app.redis, model_id, now(), "default")
-    found = app.http.post("/v1/estimate", json=body).json()
-    assert found["jobs"] == 1  # the one that cannot be read is left out
-    assert found["stages"][1]["seconds"] == pytest.approx(2 * 0.1211, abs=0.1)
-    assert found["seconds"] == pytest.approx(17.5, abs=0.2)
-    assert STORED.name not in json.dumps(found)
+    answer = app.http.post("/v1/estimate", json=body).json()
+    assert answer["jobs"] == 1  # the one that cannot be read is left out
+    assert answer["stages"][1]["seconds"] == pytest.approx(2 * 0.1211, abs=0.1)
+    assert answer["seconds"] == pytest.approx(17.5, abs=0.2)
+    assert STORED.name not in json.dumps(answer)
     assert app.http.get("/v1/jobs").json()["jobs"] == []
 
 

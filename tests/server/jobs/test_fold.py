@@ -59,15 +59,15 @@ def test_a_random_walk_keeps_every_rule(walk: Any, generation: int, verdict: Any
     counted = [
         s for s in ours if state_of(s) is not JobState.cancelled and (not verdict or s.order <= (after, 0))
     ]
-    attempt, seen = 0, JobState.queued
+    attempt, current = 0, JobState.queued
     for stored in counted:
-        if stored.attempt < attempt or seen.final:
+        if stored.attempt < attempt or current.final:
             continue
-        attempt, seen = stored.attempt, state_of(stored)
+        attempt, current = stored.attempt, state_of(stored)
     assert job.attempt == attempt
-    assert job.state is (seen if seen.final or not verdict else JobState(verdict[1]))
+    assert job.state is (current if current.final or not verdict else JobState(verdict[1]))
     assert (job.model is not None) == (job.state is JobState.succeeded)
-    assert (job.problem is not None) == (job.state is JobState.failed and seen is JobState.failed)
+    assert (job.problem is not None) == (job.state is JobState.failed and current is JobState.failed)
     assert (job.finished_at is not None) == job.state.final
 
     # Final is final: whatever is appended later changes nothing.

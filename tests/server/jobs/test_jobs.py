@@ -155,18 +155,18 @@ def test_pages_of_jobs_hold_each_once_newest_first(app: ServedApp) -> None:
 
 
 def created(app: ServedApp, job_id: str) -> tuple[int, str]:
-    found = row.read(app.redis, job_id)
-    assert found is not None
-    return int(found.created_at.timestamp() * 1000), job_id
+    job_row = row.read(app.redis, job_id)
+    assert job_row is not None
+    return int(job_row.created_at.timestamp() * 1000), job_id
 
 
 def pages(app: ServedApp, **params: Any) -> list[str]:
-    seen: list[str] = []
+    ids: list[str] = []
     while True:
         page = app.http.get("/v1/jobs", params=params).json()
-        seen += [job["id"] for job in page["jobs"]]
+        ids += [job["id"] for job in page["jobs"]]
         if page["cursor"] is None:
-            return seen
+            return ids
         params["cursor"] = page["cursor"]
 
 
@@ -195,7 +195,7 @@ def test_a_list_by_state_holds_each_job_that_is_in_the_state_and_no_other(app: S
         cancelled: "cancelled",
     }
     for state in JobState:
-        listed = {job_id for job_id, found in states.items() if found == state.value}
+        listed = {job_id for job_id, current in states.items() if current == state.value}
         assert set(pages(app, limit=1, state=state.value)) == listed, state
 
 
@@ -240,9 +240,9 @@ def test_a_failed_job_says_why_and_restarts_as_a_new_generation(app: ServedApp) 
     assert again.status_code == 202
     assert (again.json()["state"], again.json().get("problem")) == ("queued", None)
     assert app.http.post(f"/v1/jobs/{job_id}/restart").status_code == 202  # wishing twice is wishing once
-    found = row.read(app.redis, job_id)
-    assert found is not None
-    assert found.generation == 2
+    job_row = row.read(app.redis, job_id)
+    assert job_row is not None
+    assert job_row.generation == 2
     assert queue.status(app.redis, job_id, 2).state == "waiting"
 
 

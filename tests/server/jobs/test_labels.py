@@ -208,13 +208,13 @@ def several(app: ServedApp) -> dict[str, str]:
 
 def names_of(app: ServedApp, noun: str, names: dict[str, str], **query: str | bool) -> list[str]:
     """The names of the records of a list, read over pages of three."""
-    found: list[str] = []
+    all_names: list[str] = []
     asked: dict[str, str | bool | int] = {**query, "limit": 3}
     while True:
         page = app.http.get(f"/v1/{noun}", params=asked).json()
-        found += [names[record["id"]] for record in page[noun]]
+        all_names += [names[record["id"]] for record in page[noun]]
         if page["cursor"] is None:
-            return found
+            return all_names
         asked["cursor"] = page["cursor"]
 
 

@@ -39,8 +39,8 @@ def submit(
 def drain(connection: redis.Redis, *served: Line) -> list[str]:
     """The jobs that a worker takes, in order, until none is left for it."""
     taken = []
-    while (found := lines.take(connection, "tester", served or LINES)) is not None:
-        taken.append(entries.split_rq_id(found[0].entry)[0])
+    while (turn := lines.take(connection, "tester", served or LINES)) is not None:
+        taken.append(entries.split_rq_id(turn[0].entry)[0])
     return taken
 
 
@@ -126,8 +126,8 @@ def test_taking_leases_in_the_same_step(connection: redis.Redis) -> None:
     lease = take(connection, worker="mill-1")
     assert lease.entry == entry
     assert leases.held(connection) == [lease]
-    found = queue.status(connection, "job00001", 1)
-    assert (found.state, found.worker) == ("running", "mill-1")
+    status = queue.status(connection, "job00001", 1)
+    assert (status.state, status.worker) == ("running", "mill-1")
     assert leases.running(connection).keys() == {"mill-1"}
 
 
@@ -174,9 +174,9 @@ def test_the_position_is_the_order_in_which_a_worker_takes_them(
         if batch is earlier:
             for _ in range(taken):
                 lines.take(connection, "tester", served)
-    found = lines.look(connection, all_entries)
+    order = lines.look(connection, all_entries)
     predicted = {
-        entry: found.position(entry, served) for entry, place in found.places.items() if place.line in served
+        entry: order.position(entry, served) for entry, place in order.places.items() if place.line in served
     }
     actual = [f"{job}-1" for job in drain(connection, *served)]
     assert predicted == {entry: number for number, entry in enumerate(actual)}

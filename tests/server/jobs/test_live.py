@@ -78,7 +78,7 @@ def test_both_events_reach_clients(app: ServedApp) -> None:
     app.say(job_id, StateEvent(state=JobState.training))
     app.say(job_id, SnapshotEvent(step=40, seconds=1.5, gaussians=90, shown=90, bytes=1440))
     app.finish(job_id)
-    found = [event["event"] for event in follow(app, job_id)]
-    assert [event["type"] for event in found if event["type"] != "state"] == ["cameras", "snapshot"]
-    assert [event["step"] for event in found if event["type"] == "snapshot"] == [40]
-    assert [event["final"] for event in found if event["type"] == "cameras"] == [True]
+    events = [event["event"] for event in follow(app, job_id)]
+    assert [event["type"] for event in events if event["type"] != "state"] == ["cameras", "snapshot"]
+    assert [event["step"] for event in events if event["type"] == "snapshot"] == [40]
+    assert [event["final"] for event in events if event["type"] == "cameras"] == [True]

@@ -37,7 +37,7 @@ from tests.support.servers.server_events import brief, follow
 
 def listed(app: ServedApp, path: str = "/v1/jobs") -> dict[str, Any]:
     name = path.partition("?")[0].rpartition("/")[2]
-    return {found["id"]: found for found in app.http.get(path).json()[name]}
+    return {record["id"]: record for record in app.http.get(path).json()[name]}
 
 
 def emptied(app: ServedApp) -> None:
@@ -107,9 +107,9 @@ def test_ended_jobs_are_as_they_were(app: ServedApp) -> None:
         assert brief(follow(app, job_id))[-1] == end
         again = app.http.post(f"/v1/jobs/{job_id}/restart")
         assert (again.status_code, again.json()["state"]) == (202, "queued")
-        found = row.read(app.redis, job_id)
-        assert found is not None
-        assert found.generation == 2
+        job_row = row.read(app.redis, job_id)
+        assert job_row is not None
+        assert job_row.generation == 2
     assert not any(app.redis.sismember(keys.RESTORED, job_id) for job_id in jobs)
 
 
@@ -155,9 +155,9 @@ def test_a_job_that_ended_is_not_begun_again_where_its_request_was_left(app: Ser
     app.http.post(f"/v1/jobs/{job_id}/restart").raise_for_status()
     emptied(app)
     assert app.state(job_id) == "queued"
-    found = row.read(app.redis, job_id)
-    assert found is not None
-    assert found.generation == 2
+    job_row = row.read(app.redis, job_id)
+    assert job_row is not None
+    assert job_row.generation == 2
 
 
 def test_a_single_lost_row_is_restored_at_the_second_look(app: ServedApp) -> None:

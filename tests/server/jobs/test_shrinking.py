@@ -58,8 +58,10 @@ def talk(app: ServedApp, job_id: str, count: int) -> None:
 
 def answers(app: ServedApp, job_id: str) -> dict[str, Any]:
     """What clients can ask of a job."""
-    found = {name: app.http.get(f"/v1/jobs/{job_id}{name}") for name in ("", "/logs", "/curve", "/preview")}
-    return {name: answer.content for name, answer in found.items()} | {
+    responses = {
+        name: app.http.get(f"/v1/jobs/{job_id}{name}") for name in ("", "/logs", "/curve", "/preview")
+    }
+    return {name: answer.content for name, answer in responses.items()} | {
         "listed": app.http.get("/v1/jobs").json()["jobs"]
     }
 
@@ -112,7 +114,7 @@ def test_the_log_and_curve_of_a_restarted_job_begin_with_those_from_before(app: 
     lines = app.http.get(f"/v1/jobs/{job_id}/logs").json()["lines"]
     assert [line["message"] for line in lines] == ["first", "second", "third"]
     rows = app.http.get(f"/v1/jobs/{job_id}/curve").json()["rows"]
-    assert [found["step"] for found in rows] == [10, 20, 30]
+    assert [point["step"] for point in rows] == [10, 20, 30]
     assert app.state(job_id) == "queued"
 
 

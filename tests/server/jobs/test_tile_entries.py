@@ -24,9 +24,9 @@ def row(connection: redis.Redis) -> None:
 
 
 def take(connection: redis.Redis) -> leases.Lease:
-    found = lines.take(connection, "tester", LINES)
-    assert found is not None
-    return found[0]
+    turn = lines.take(connection, "tester", LINES)
+    assert turn is not None
+    return turn[0]
 
 
 @given(

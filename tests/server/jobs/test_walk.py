@@ -49,10 +49,10 @@ class Walk(RuleBasedStateMachine):
         return self.service.redis
 
     def entry(self, job_id: str) -> QueueJob | None:
-        found = row.read(self.redis, job_id)
-        if found is None or queue.status(self.redis, job_id, found.generation).state == "absent":
+        job_row = row.read(self.redis, job_id)
+        if job_row is None or queue.status(self.redis, job_id, job_row.generation).state == "absent":
             return None
-        rq_id = entries.rq_id(job_id, found.generation)
+        rq_id = entries.rq_id(job_id, job_row.generation)
         return QueueJob.fetch(rq_id, connection=self.redis, serializer=entries.SERIALIZER)
 
     @rule(target=jobs)
@@ -66,8 +66,8 @@ class Walk(RuleBasedStateMachine):
     @rule(job_id=jobs, phase=st.sampled_from(PHASES), stale=st.booleans())
     def worker_says(self, job_id: str, phase: JobState, stale: bool) -> None:
         """A worker takes the job from the queue if it waits there, and says where it is; or an old one still talks."""
-        entry, found = self.entry(job_id), row.read(self.redis, job_id)
-        if entry is None or found is None:
+        entry, job_row = self.entry(job_id), row.read(self.redis, job_id)
+        if entry is None or job_row is None:
             return
         if lines.withdraw(self.redis, entry.id):
             entry.set_status(JobStatus.STARTED)
@@ -75,16 +75,16 @@ class Walk(RuleBasedStateMachine):
         number = int(self.redis.get(keys.attempts(job_id)) or 0)
         if number:
             attempt = max(1, number - 1) if stale else number
-            events.append(self.redis, job_id, found.generation, attempt, StateEvent(state=phase))
+            events.append(self.redis, job_id, job_row.generation, attempt, StateEvent(state=phase))
 
     @rule(job_id=jobs, how=st.sampled_from(["succeeded", "failed", "died", "silent", "stopped"]))
     def worker_ends(self, job_id: str, how: str) -> None:
-        entry, found = self.entry(job_id), row.read(self.redis, job_id)
-        if entry is None or found is None or entry.get_status() != JobStatus.STARTED:
+        entry, job_row = self.entry(job_id), row.read(self.redis, job_id)
+        if entry is None or job_row is None or entry.get_status() != JobStatus.STARTED:
             return
         if how in JobState.__members__:
             number = int(self.redis.get(keys.attempts(job_id)) or 0)
-            events.append(self.redis, job_id, found.generation, number, StateEvent(state=JobState(how)))
+            events.append(self.redis, job_id, job_row.generation, number, StateEvent(state=JobState(how)))
         status = {"died": JobStatus.FAILED, "stopped": JobStatus.STOPPED}.get(how, JobStatus.FINISHED)
         entry.set_status(status)
 
@@ -100,7 +100,7 @@ class Walk(RuleBasedStateMachine):
     @rule(job_id=jobs)
     def client_restarts(self, job_id: str) -> None:
         job = self.attempt(
-            lambda found: self.service.admission.restart(KEYLESS, found), job_id, {"job_running"}
+            lambda name: self.service.admission.restart(KEYLESS, name), job_id, {"job_running"}
         )
         if job is not None:
             assert job.state is JobState.queued
@@ -131,13 +131,13 @@ class Walk(RuleBasedStateMachine):
     @invariant()
     def final_is_final(self) -> None:
         for job_id in self.known:
-            job, found = self.service.jobs.get(job_id), row.read(self.redis, job_id)
-            assert found is not None
+            job, job_row = self.service.jobs.get(job_id), row.read(self.redis, job_id)
+            assert job_row is not None
             if job_id in self.ended:
                 generation, told = self.ended[job_id]
-                assert (found.generation, job) == (generation, told)
+                assert (job_row.generation, job) == (generation, told)
             elif job.state.final:
-                self.ended[job_id] = (found.generation, job)
+                self.ended[job_id] = (job_row.generation, job)
 
     @invariant()
     def at_most_one_attempt_waits(self) -> None:
@@ -157,11 +157,11 @@ class Walk(RuleBasedStateMachine):
         for _ in range(3):
             self.service.reaper.tick()
         for job_id in self.known:
-            job, found = self.service.jobs.get(job_id), row.read(self.redis, job_id)
-            assert found is not None
-            standing = queue.status(self.redis, job_id, found.generation).state
+            job, job_row = self.service.jobs.get(job_id), row.read(self.redis, job_id)
+            assert job_row is not None
+            standing = queue.status(self.redis, job_id, job_row.generation).state
             assert job.state.final or standing in ("waiting", "running"), (job, standing)
-            if found.cancel_requested_at is not None:
+            if job_row.cancel_requested_at is not None:
                 assert job.state.final or standing == "running"
 
 

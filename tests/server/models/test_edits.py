@@ -47,12 +47,12 @@ def test_a_part_of_a_model_becomes_a_new_one(app: ServedApp, folder: Path, tmp_p
     right = int((ply.read(folder / "model.ply").gaussians.means[:, 0] >= 0).sum())
     with Client(str(app.http.base_url)) as client:
         model = client.model(MODEL)
-        seen = model.edit(box=RIGHT, preview=True)
-        assert (seen.model, seen.gaussians_before, seen.gaussians) == (None, 400, right)
-        assert [view.name for view in seen.views] == ["0.jpg", "1.jpg"]
-        assert seen.psnr_before is not None
-        assert seen.psnr is not None
-        assert seen.psnr < seen.psnr_before, "the ball's left half shows in the second photo"
+        preview = model.edit(box=RIGHT, preview=True)
+        assert (preview.model, preview.gaussians_before, preview.gaussians) == (None, 400, right)
+        assert [view.name for view in preview.views] == ["0.jpg", "1.jpg"]
+        assert preview.psnr_before is not None
+        assert preview.psnr is not None
+        assert preview.psnr < preview.psnr_before, "the ball's left half shows in the second photo"
         assert len([*client.models()]) == 1
         made = model.edit(box=RIGHT, min_opacity=0.1, name="half a ball")
         assert made.model is not None
@@ -105,13 +105,13 @@ def test_the_command_says_what_is_left_out(app: ServedApp) -> None:
     hold_out(app, MODEL, VIEWS)
     at = ("--server", str(app.http.base_url))
     corners = ("--box", "0", "-2", "-2", "2", "2", "2")
-    seen = invoke("edit", MODEL, *corners, "--preview", *at)
-    assert (seen.exit_code, seen.stdout.count("\n")) == (0, 1), seen.output
-    assert seen.stdout.endswith(
+    preview = invoke("edit", MODEL, *corners, "--preview", *at)
+    assert (preview.exit_code, preview.stdout.count("\n")) == (0, 1), preview.output
+    assert preview.stdout.endswith(
         " of 400 Gaussians would be left out. The photos show what is left out, so they do not measure what is left.\n"
     )
     record = json.loads(invoke("edit", MODEL, *corners, "--preview", "--json", *at).stdout)
-    assert f"{400 - record['gaussians']} of 400" in seen.stdout
+    assert f"{400 - record['gaussians']} of 400" in preview.stdout
     assert record["crops"] is True
     cleaned = invoke("edit", MODEL, "--min-opacity", "0.1", "--preview", *at)
     assert " of 400 Gaussians would be left out. PSNR on 2 held-out photos: " in cleaned.stdout

@@ -154,13 +154,13 @@ def test_pages_of_models_hold_each_once(app: ServedApp) -> None:
     ids = [f"{i:016x}" for i in range(5)]
     for model_id in ids:
         store_model(app.service, model_id)
-    seen, cursor = [], None
+    all_ids, cursor = [], None
     while True:
         page = app.http.get("/v1/models", params={"limit": 2} | ({"cursor": cursor} if cursor else {})).json()
-        seen += [m["id"] for m in page["models"]]
+        all_ids += [m["id"] for m in page["models"]]
         if (cursor := page["cursor"]) is None:
             break
-    assert sorted(seen) == ids
+    assert sorted(all_ids) == ids
 
 
 def test_files_have_the_digests_that_the_worker_stored(app: ServedApp) -> None:
@@ -179,7 +179,7 @@ def test_files_have_the_digests_that_the_worker_stored(app: ServedApp) -> None:
     app.service.storage.put(
         path, json.dumps(record | {"sha256": {"model.ply": digest, "report.json": 7}}).encode()
     )
-    assert {name: found for name, found in digests().items() if found} == {"model.ply": digest}
+    assert {name: sha256 for name, sha256 in digests().items() if sha256} == {"model.ply": digest}
     app.service.storage.put(path, json.dumps(record | {"sha256": "x"}).encode())
     assert set(digests().values()) == {None}
 
@@ -191,6 +191,6 @@ def test_a_report_of_a_later_format_is_refused_by_name(app: ServedApp) -> None:
     path = layout.model_file(job_id, "report.json")
     report = json.loads(app.service.storage.get(path)) | {"format": 2}
     app.service.storage.put(path, json.dumps(report).encode())
-    found = problem(app.http.get(f"/v1/jobs/{job_id}/report"), 500, "model_corrupt")
-    assert "it has format 2, and this version reads formats up to 1" in found["detail"]
+    refusal = problem(app.http.get(f"/v1/jobs/{job_id}/report"), 500, "model_corrupt")
+    assert "it has format 2, and this version reads formats up to 1" in refusal["detail"]
     assert app.http.get(f"/v1/models/{job_id}").status_code == 200

@@ -111,9 +111,9 @@ def test_the_page_in_one_file_shows_the_same(app: ServedApp) -> None:
             start_view=BEHIND, annotations=[{"point": [0, 0, 0], "text": "</script>"}], background="white"
         )
     page = app.http.get(f"/v1/models/{MODEL}/download/html").text
-    found = re.search(r'id="options">(.*?)</script>', page)
-    assert found is not None
-    options = json.loads(found[1])
+    match = re.search(r'id="options">(.*?)</script>', page)
+    assert match is not None
+    options = json.loads(match[1])
     assert options["presentation"]["annotations"] == [{"point": [0, 0, 0], "text": "</script>"}]
     assert options["camera"] == BEHIND.model_dump(mode="json", exclude_none=True)
     assert options["background"] == "white"

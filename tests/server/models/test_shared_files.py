@@ -60,14 +60,14 @@ def test_a_link_gives_out_nothing_about_the_machine(serve: Serve, tmp_path: Path
     )
     job = app.job(steps=40)
     app.begin(job)
-    found = row.read(app.redis, job)
-    assert found is not None
+    job_row = row.read(app.redis, job)
+    assert job_row is not None
     publish(
         app.service.storage,
-        Attempt(app.redis, job, found.generation, 1, JobLock(app.redis, job, "token")),
-        found,
+        Attempt(app.redis, job, job_row.generation, 1, JobLock(app.redis, job, "token")),
+        job_row,
         outcome.out,
-        Room(app.redis, found.owner, job),
+        Room(app.redis, job_row.owner, job),
     )
     links = [
         app.http.post(f"/v1/models/{job}/shares", json={"photos": photos}).raise_for_status().json()["path"]
@@ -87,12 +87,12 @@ def test_a_link_gives_out_nothing_about_the_machine(serve: Serve, tmp_path: Path
             "time_lapse/000.ply",
         } <= {*names}
         assert any(name.startswith("held_out/") for name in names)
-        given = {name: stranger.get(f"{base}/files/{name}").raise_for_status() for name in names}
-        given |= {path: stranger.get(base + path) for path in ("", "/cameras", "/formats")} | {
+        answers = {name: stranger.get(f"{base}/files/{name}").raise_for_status() for name in names}
+        answers |= {path: stranger.get(base + path) for path in ("", "/cameras", "/formats")} | {
             "page": stranger.get(link)
         }
         for kind, secret in secrets_of(work).items():
-            for name, answer in given.items():
+            for name, answer in answers.items():
                 assert secret not in unpacked(answer.content), f"{name} names the {kind} of the machine"
                 assert secret not in repr(answer.headers).encode(), f"the headers of {name} name the {kind}"
         for hidden in ("job.json", "frame.json", "report.json"):

@@ -118,8 +118,8 @@ def test_a_wrong_secret_is_not_told_from_an_unknown_link(app: ServedApp, strange
     token = share(app)["token"]
     wrong = token[:-1] + ("0" if token[-1] != "0" else "1")
     unknown = f"{MODEL}-{'0' * 8}-{token[-32:]}"
-    found = [problem(stranger.get(f"/s/{t}/model"), 404, "share_not_found") for t in (wrong, unknown)]
-    assert found[0]["detail"] == found[1]["detail"]
+    refusals = [problem(stranger.get(f"/s/{t}/model"), 404, "share_not_found") for t in (wrong, unknown)]
+    assert refusals[0]["detail"] == refusals[1]["detail"]
 
 
 def test_links_end_by_revocation_expiry_and_with_the_model(app: ServedApp, stranger: httpx.Client) -> None:
@@ -133,7 +133,7 @@ def test_links_end_by_revocation_expiry_and_with_the_model(app: ServedApp, stran
         assert "og:title" not in stranger.get(ended["path"]).text
     assert stranger.get(last["path"] + "/model").status_code == 200
     listed = app.http.get(f"/v1/models/{MODEL}/shares").json()["shares"]
-    assert {found["id"]: found["active"] for found in listed} == {
+    assert {entry["id"]: entry["active"] for entry in listed} == {
         revoked["id"]: False,
         expired["id"]: False,
         last["id"]: True,
@@ -170,7 +170,7 @@ def test_only_the_digest_of_a_token_is_kept(
         return [line for line in logged if line["event"] == "request" and line["method"] == "GET"]
 
     # The line of a request is written after its answer.
-    requests = wait_for(lambda: found if len(found := visits()) == len(paths) else None)
+    requests = wait_for(lambda: entries if len(entries := visits()) == len(paths) else None)
     logged = [dict(call.kwargs) for call in lines.calls]
     assert secret not in json.dumps(logged, default=str)
     assert {line["path"] for line in requests} >= {"/s/...", "/s/.../embed", "/s/.../model/files/model.ply"}
@@ -196,7 +196,7 @@ def test_links_to_a_model_are_bounded_and_old_ones_forgotten(app: ServedApp) -> 
     problem(app.http.post(f"/v1/models/{MODEL}/shares", json={}), 429, "too_many_requests")
     age(app, first, KEPT_ENDED + timedelta(days=31))
     share(app)
-    listed = {found["id"] for found in app.http.get(f"/v1/models/{MODEL}/shares").json()["shares"]}
+    listed = {entry["id"] for entry in app.http.get(f"/v1/models/{MODEL}/shares").json()["shares"]}
     assert first["id"] not in listed
     assert len(listed) == MAX_SHARES
 

@@ -38,24 +38,24 @@ WHOLE = ["queued", "preparing", "sfm", 1, "training", "plan", "log", 2, 3, 4, 5,
 
 
 def test_a_stream_tells_everything_once_in_order_and_ends(app: ServedApp) -> None:
-    found = follow(app, a_whole_job(app))
+    records = follow(app, a_whole_job(app))
     # Both streams are put in order by Redis's clock; within one of its milliseconds progress goes first.
-    assert sorted(map(str, brief(found))) == sorted(map(str, WHOLE))
-    assert [b for b in brief(found) if isinstance(b, int)] == [1, 2, 3, 4, 5]
-    assert [b for b in brief(found) if b in JobState.__members__] == [
+    assert sorted(map(str, brief(records))) == sorted(map(str, WHOLE))
+    assert [b for b in brief(records) if isinstance(b, int)] == [1, 2, 3, 4, 5]
+    assert [b for b in brief(records) if b in JobState.__members__] == [
         *("queued", "preparing", "sfm", "training", "succeeded"),
     ]
-    assert brief(found)[-1] == "succeeded"
-    assert [e["attempt"] for e in found] == [0] + [1] * 11
+    assert brief(records)[-1] == "succeeded"
+    assert [e["attempt"] for e in records] == [0] + [1] * 11
 
 
 def test_a_reconnect_after_any_event_goes_on_exactly_there(app: ServedApp) -> None:
     job_id = a_whole_job(app)
-    found = follow(app, job_id)
-    for index, event in enumerate(found):
-        assert follow(app, job_id, event["id"]) == found[index + 1 :]
+    records = follow(app, job_id)
+    for index, event in enumerate(records):
+        assert follow(app, job_id, event["id"]) == records[index + 1 :]
     # A browser stops reconnecting at 204 and at nothing else.
-    answer = app.http.get(f"/v1/jobs/{job_id}/events", headers={"Last-Event-ID": found[-1]["id"]})
+    answer = app.http.get(f"/v1/jobs/{job_id}/events", headers={"Last-Event-ID": records[-1]["id"]})
     assert answer.status_code == 204
 
 
@@ -78,15 +78,15 @@ def test_events_arrive_while_they_happen_with_heartbeats_between(serve: Serve) -
 @pytest.mark.slow
 def test_a_cancelled_job_ends_its_stream_with_the_servers_word(app: ServedApp) -> None:
     job_id = app.job()
-    found: list[dict[str, Any]] = []
-    reader = threading.Thread(target=lambda: found.extend(follow(app, job_id)))
+    records: list[dict[str, Any]] = []
+    reader = threading.Thread(target=lambda: records.extend(follow(app, job_id)))
     reader.start()
     assert app.http.post(f"/v1/jobs/{job_id}/cancel").json()["state"] == "cancelled"
     reader.join(60)
-    assert brief(found) == ["queued", "cancelled"]
-    assert {e["attempt"] for e in found} == {0}
-    assert follow(app, job_id, found[0]["id"]) == found[1:]
-    assert follow(app, job_id, found[1]["id"]) == []
+    assert brief(records) == ["queued", "cancelled"]
+    assert {e["attempt"] for e in records} == {0}
+    assert follow(app, job_id, records[0]["id"]) == records[1:]
+    assert follow(app, job_id, records[1]["id"]) == []
 
 
 def test_what_a_superseded_attempt_still_says_is_not_told(app: ServedApp) -> None:
@@ -96,8 +96,8 @@ def test_what_a_superseded_attempt_still_says_is_not_told(app: ServedApp) -> Non
     app.say(job_id, StateEvent(state=JobState.succeeded), attempt=1)
     app.say(job_id, ProgressEvent(stage="training", done=99), attempt=1)
     app.say(job_id, ProgressEvent(stage="training", done=7), StateEvent(state=JobState.succeeded))
-    found = follow(app, job_id)
-    assert brief(found) == ["queued", "preparing", "preparing", 7, "succeeded"]
+    records = follow(app, job_id)
+    assert brief(records) == ["queued", "preparing", "preparing", 7, "succeeded"]
 
 
 def test_a_cancelled_job_whose_last_state_did_not_count_still_ends_its_stream(app: ServedApp) -> None:
@@ -108,9 +108,9 @@ def test_a_cancelled_job_whose_last_state_did_not_count_still_ends_its_stream(ap
     app.http.post(f"/v1/jobs/{job_id}/cancel")
     app.service.reaper.tick()
     shrink(app.redis, job_id)
-    found = follow(app, job_id)
-    assert brief(found) == ["queued", "preparing", "preparing", "cancelled"]
-    assert follow(app, job_id, found[-1]["id"]) == []
+    records = follow(app, job_id)
+    assert brief(records) == ["queued", "preparing", "preparing", "cancelled"]
+    assert follow(app, job_id, records[-1]["id"]) == []
 
 
 def test_a_restarted_job_goes_on_after_the_last_id(app: ServedApp) -> None:
@@ -179,8 +179,8 @@ def test_neither_progress_nor_a_talkative_log_pushes_out_warnings_and_the_curve(
     assert lines[-1]["message"].startswith("line ")
     assert [row["step"] for row in app.http.get(f"/v1/jobs/{job_id}/curve").json()["rows"]] == [1]
     app.say(job_id, StateEvent(state=JobState.succeeded))
-    found = brief(follow(app, job_id))
-    assert found.count("metric") == 1
+    words = brief(follow(app, job_id))
+    assert words.count("metric") == 1
 
 
 def test_the_curve_is_that_of_the_training_that_went_on(app: ServedApp) -> None:

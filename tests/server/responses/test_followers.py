@@ -88,9 +88,9 @@ def test_many_followers_of_several_jobs_share_one_reader(app: ServedApp) -> None
             app.say(job_id, *(ProgressEvent(stage="training", done=n) for n in range(1, 4)))
             app.say(job_id, StateEvent(state=JobState.succeeded))
 
-    found = asyncio.run(followed(app, [jobs[n % 3] for n in range(FOLLOWERS)], act))
+    streams = asyncio.run(followed(app, [jobs[n % 3] for n in range(FOLLOWERS)], act))
     expected = ["queued", "preparing", "log", "training", 1, 2, 3, "succeeded"]
-    assert [brief(told) for told in found] == [expected] * FOLLOWERS
+    assert [brief(told) for told in streams] == [expected] * FOLLOWERS
     wait_for(lambda: app.service.feed.followers == 0)
     clients: Any = app.redis.client_list()
     assert len(clients) < 60
@@ -107,8 +107,8 @@ def test_more_followers_than_the_process_takes_are_told_why(serve: Serve) -> Non
         assert "SPLATMILL_MAX_EVENT_STREAMS" in refused["detail"]
         app.http.post(f"/v1/jobs/{job_id}/cancel")
 
-    found = asyncio.run(followed(app, [job_id] * 2, act))
-    assert [brief(told) for told in found] == [["queued", "cancelled"]] * 2
+    streams = asyncio.run(followed(app, [job_id] * 2, act))
+    assert [brief(told) for told in streams] == [["queued", "cancelled"]] * 2
     wait_for(lambda: app.service.feed.followers == 0)
     assert brief(follow(app, job_id)) == ["queued", "cancelled"]
 
@@ -129,8 +129,8 @@ def test_followers_of_one_owner_leave_places_to_others(serve: Serve, monkeypatch
             assert answer.status_code == 200
         app.http.post(f"/v1/jobs/{job_id}/cancel")
 
-    found = asyncio.run(followed(app, [job_id] * 3, act))
-    assert [brief(told) for told in found] == [["queued", "cancelled"]] * 3
+    streams = asyncio.run(followed(app, [job_id] * 3, act))
+    assert [brief(told) for told in streams] == [["queued", "cancelled"]] * 3
 
 
 def test_a_follower_that_comes_later_misses_nothing_and_hears_nothing_twice(app: ServedApp) -> None:
@@ -243,9 +243,9 @@ def test_a_position_beyond_the_end_concerns_nobody_else_and_misses_nothing(
         app.say(job_id, ProgressEvent(stage="training", done=2), LogEvent(message="late"))
         app.say(job_id, StateEvent(state=JobState.succeeded))
 
-    found = asyncio.run(followed(app, [job_id] * 3, act, [after, None, after]))
+    streams = asyncio.run(followed(app, [job_id] * 3, act, [after, None, after]))
     expected = ["queued", "preparing", 1, "log", 2, "log", "succeeded"]
-    assert [brief(told) for told in found] == [expected] * 3
+    assert [brief(told) for told in streams] == [expected] * 3
 
 
 def test_followers_hear_of_a_redis_that_was_restored_with_an_older_clock(
@@ -266,18 +266,18 @@ def test_followers_hear_of_a_redis_that_was_restored_with_an_older_clock(
                 app.redis.xadd(stream(job_id), fields, id=f"{1000 + number}-0")
 
     # The streams of those who follow end, so that they come back.
-    found = asyncio.run(followed(app, [job_id], restored))
-    assert [brief(told)[:2] for told in found] == [["queued", "preparing"]]
-    assert [len(told) for told in found] == [4]
+    streams = asyncio.run(followed(app, [job_id], restored))
+    assert [brief(told)[:2] for told in streams] == [["queued", "preparing"]]
+    assert [len(told) for told in streams] == [4]
 
     def act() -> None:
         fields: Any = {"g": 1, "a": 1, "e": StateEvent(state=JobState.succeeded).model_dump_json()}
         app.redis.xadd(keys.states(job_id), fields, id="2000-0")
 
-    found = asyncio.run(followed(app, [job_id] * 2, act, [found[0][-1]["id"], None]))
-    assert [brief(told)[0] for told in found] == ["queued"] * 2
-    assert [brief(told)[-1] for told in found] == ["succeeded"] * 2
-    assert [len(told) for told in found] == [5, 5]
+    streams = asyncio.run(followed(app, [job_id] * 2, act, [streams[0][-1]["id"], None]))
+    assert [brief(told)[0] for told in streams] == ["queued"] * 2
+    assert [brief(told)[-1] for told in streams] == ["succeeded"] * 2
+    assert [len(told) for told in streams] == [5, 5]
 
 
 def test_a_reader_that_cannot_go_on_ends_the_streams(app: ServedApp, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -291,8 +291,8 @@ def test_a_reader_that_cannot_go_on_ends_the_streams(app: ServedApp, monkeypatch
         monkeypatch.setattr(app.service.feed, "_pass_on", broken)
         app.say(job_id, LogEvent(message="after"))
 
-    found = asyncio.run(followed(app, [job_id] * 2, act))
-    assert [brief(told)[:2] for told in found] == [["queued", "preparing"]] * 2
+    streams = asyncio.run(followed(app, [job_id] * 2, act))
+    assert [brief(told)[:2] for told in streams] == [["queued", "preparing"]] * 2
     monkeypatch.undo()
     app.say(job_id, StateEvent(state=JobState.failed))
     assert brief(follow(app, job_id)) == ["queued", "preparing", "log", "failed"]

@@ -249,7 +249,7 @@ def test_models_that_are_not_there_are_said_so_before_rendering(app: ServedApp) 
 
 
 def test_an_etag_of_other_bytes_than_ascii_is_not_passed_on(app: ServedApp) -> None:
-    for given in (b"\xff\xe9", b'"\xc3\xa9"', b"a" * 5000):
-        headers = {b"If-None-Match": given, b"Content-Type": b"application/json"}
+    for etag in (b"\xff\xe9", b'"\xc3\xa9"', b"a" * 5000):
+        headers = {b"If-None-Match": etag, b"Content-Type": b"application/json"}
         body = json.dumps({"camera": CAMERA}).encode()
         assert app.http.post(f"/v1/models/{MODEL}/render", content=body, headers=headers).status_code == 200

@@ -79,9 +79,9 @@ def test_a_job_is_not_inserted_once_a_deletion_has_begun(
     meeting = once(meet)
 
     def looked(connection: object) -> object:
-        found = look(connection)  # type: ignore[arg-type]  # a connection
+        jobs = look(connection)  # type: ignore[arg-type]  # a connection
         meeting()  # after the deletion has looked, and before it deletes
-        return found
+        return jobs
 
     monkeypatch.setattr("splatmill_server.space.deletion.unfinished_jobs", looked)
     app.service.deletion.capture(capture)

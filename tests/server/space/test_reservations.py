@@ -106,15 +106,15 @@ def test_orbit_videos_fail_where_the_quota_ends(app: ServedApp) -> None:
     def ended() -> bool:
         return not list(app.service.storage.entries(layout.unfinished_kept("orbits")))
 
-    seen = 0
+    largest = 0
     while not ended():
-        seen = max(seen, in_storage(app))
+        largest = max(largest, in_storage(app))
     states = [orbit["state"] for orbit in ann("GET", address).json()["orbits"]]
     failed = [orbit for orbit in ann("GET", address).json()["orbits"] if orbit["state"] == "failed"]
     assert "succeeded" in states
     assert failed
     assert {orbit["problem"]["code"] for orbit in failed} == {"quota_exceeded"}
-    assert max(seen, in_storage(app)) <= limit
+    assert max(largest, in_storage(app)) <= limit
 
 
 def test_of_many_uploads_and_captures_at_once_those_that_fit_are_stored(app: ServedApp) -> None:
@@ -190,11 +190,11 @@ def test_a_model_that_is_made_while_storage_is_listed_is_counted_once(
     ann = Person(app.http, "default", 10**9)
 
     def walked(prefix: str) -> list[Entry]:
-        found = list(walk(prefix))
+        entries = list(walk(prefix))
         if prefix == "":
             answer = ann("POST", f"/v1/models/{MODEL}/edits", json={"min_opacity": 1e-6})
             assert answer.status_code == 201, answer.text
-        return found
+        return entries
 
     ann("POST", "/v1/captures", json={})
     monkeypatch.setattr(app.service.storage, "walk", walked)

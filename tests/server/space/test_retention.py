@@ -54,8 +54,12 @@ def sweep(app: ServedApp, days: float = 0.0, **ages: float) -> list[tuple[str, s
     app.service.sweeper.ages = Ages(**{name: count * DAY for name, count in ages.items()})
     # What a request shows beforehand is what the sweep then does.
     chief = Person(app.http, "chief")
-    shown = [(found["kind"], found["id"]) for found in chief("GET", "/v1/storage").json()["deletions"]]
-    deleted: list[tuple[str, str]] = [(found.action, found.held.id) for found in app.service.sweeper.sweep()]
+    shown = [
+        (deletion["kind"], deletion["id"]) for deletion in chief("GET", "/v1/storage").json()["deletions"]
+    ]
+    deleted: list[tuple[str, str]] = [
+        (deletion.action, deletion.held.id) for deletion in app.service.sweeper.sweep()
+    ]
     app.service.usage.ledger.clock = app.service.usage.ledger._redis_time
     assert deleted == shown
     return deleted
@@ -100,7 +104,7 @@ def test_an_upload_that_arrives_keeps_its_capture(people: ServedApp) -> None:
     service.usage.ledger.reserve("default", "arriving/x", 1, capture, None)
     assert service.sweeper.sweep() == []
     service.usage.ledger.settle("default", "arriving/x", capture, 0)
-    assert [found.held.id for found in service.sweeper.sweep()] == [capture]
+    assert [deletion.held.id for deletion in service.sweeper.sweep()] == [capture]
 
 
 def test_a_failed_job_leaves_with_its_row_its_log_and_all_its_keys(people: ServedApp) -> None:
@@ -186,8 +190,8 @@ def test_folders_without_a_record_are_deleted_after_a_grace(people: ServedApp) -
     for path in (*orphans, *kept):
         storage.put(path, b"x")
     assert sweep(people, days=0.9) == []
-    found = sweep(people, days=1.1)
-    assert sorted(found) == [("orphan", "a" * 16), ("orphan", "b" * 16), ("orphan", "c" * 16)]
+    deletions = sweep(people, days=1.1)
+    assert sorted(deletions) == [("orphan", "a" * 16), ("orphan", "b" * 16), ("orphan", "c" * 16)]
     assert not set(orphans) & set(paths(people))
     assert set(kept) <= set(paths(people))
     assert people.http.get(f"/v1/captures/{capture}").json()["files"]
@@ -199,10 +203,10 @@ def test_what_is_written_to_since_the_plan_stays(people: ServedApp, monkeypatch:
     snapshot = Usage.snapshot
 
     def then_written(self: Usage) -> object:
-        found = snapshot(self)
+        figures = snapshot(self)
         time.sleep(0.01)  # so that its time of modification differs
         people.service.storage.put(f"models/{'b' * 16}/report.json", b"x")
-        return found
+        return figures
 
     monkeypatch.setattr(Usage, "snapshot", then_written)
     people.service.usage.ledger.clock = Clock(time.time() + 2 * DAY)
@@ -218,7 +222,7 @@ def test_a_sweep_deletes_a_bounded_number_and_the_next_one_goes_on(
     captures = [people.capture() for _ in range(3)]
     first, second = sweep(people, days=9, captures=7), sweep(people, days=9, captures=7)
     assert (len(first), len(second)) == (2, 1)
-    assert {found for _, found in first + second} == set(captures)
+    assert {capture_id for _, capture_id in first + second} == set(captures)
 
 
 def test_one_process_sweeps_per_interval(serve_people: ServePeople) -> None:

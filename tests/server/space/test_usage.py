@@ -70,11 +70,11 @@ def test_bytes_are_counted_by_owner_and_by_kind(people: ServedApp) -> None:
     assert chief.use("?owner=bob") == bob.use()
     assert bob.use("?owner=ann") == bob.use()
     answer = chief("GET", "/v1/storage?largest=2").json()
-    assert [(found["kind"], found["id"]) for found in answer["largest"]] == [
+    assert [(record["kind"], record["id"]) for record in answer["largest"]] == [
         ("capture", mine),
         ("model", job_id),
     ]
-    assert [found["id"] for found in bob("GET", "/v1/storage").json()["largest"]] == [yours]
+    assert [record["id"] for record in bob("GET", "/v1/storage").json()["largest"]] == [yours]
 
 
 def test_a_folder_without_a_record_belongs_to_nobody_and_only_admins_see_it(people: ServedApp) -> None:
@@ -92,8 +92,8 @@ def test_an_unfinished_job_is_named_by_what_it_needs(people: ServedApp) -> None:
     second = ann.capture(7, 7)
     running = ann("POST", "/v1/jobs", json={"capture": second, "options": {"start": start}}).json()["id"]
     needed = {
-        (found["kind"], found["id"]): found["needed_by"]
-        for found in ann("GET", "/v1/storage").json()["largest"]
+        (record["kind"], record["id"]): record["needed_by"]
+        for record in ann("GET", "/v1/storage").json()["largest"]
     }
     assert needed == {
         ("capture", first): None,
@@ -112,9 +112,9 @@ def test_what_a_cancelled_job_left_of_a_model_is_told_from_a_model(people: Serve
     _model(people, jobs[0], "ann")
     people.service.storage.put(f"{layout.model(jobs[1])}/preview.jpg", b"half")
     complete = {
-        (found["kind"], found["id"]): found["complete"]
-        for found in ann("GET", "/v1/storage").json()["largest"]
-        if found["kind"] == "model"
+        (record["kind"], record["id"]): record["complete"]
+        for record in ann("GET", "/v1/storage").json()["largest"]
+        if record["kind"] == "model"
     }
     assert complete == {("model", jobs[0]): True, ("model", jobs[1]): False}
 
@@ -191,10 +191,10 @@ def test_a_capture_that_is_written_to_while_storage_is_listed_is_counted_once(
     walk = people.service.storage.walk
 
     def walked(prefix: str) -> list[Entry]:
-        found = list(walk(prefix))
+        entries = list(walk(prefix))
         if prefix == "":
             assert ann.put(capture, "meanwhile.jpg", b"x" * 500).status_code == 201
-        return found
+        return entries
 
     monkeypatch.setattr(people.service.storage, "walk", walked)
     usage.scan()
@@ -293,7 +293,7 @@ def test_only_folders_of_records_are_counted() -> None:
         return Entry(path, 1, "", datetime.fromtimestamp(5, UTC))
 
     name = "a" * 16
-    found = sums(
+    totals = sums(
         entry(path)
         for path in (
             f"models/{name}/job.json",
@@ -303,9 +303,9 @@ def test_only_folders_of_records_are_counted() -> None:
             "health/1",
         )
     )
-    assert list(found) == [(StoredKind.model, name)]
-    assert found[StoredKind.model, name].whole
-    assert (found[StoredKind.model, name].files, found[StoredKind.model, name].modified) == (2, 5.0)
+    assert list(totals) == [(StoredKind.model, name)]
+    assert totals[StoredKind.model, name].whole
+    assert (totals[StoredKind.model, name].files, totals[StoredKind.model, name].modified) == (2, 5.0)
 
 
 def test_redis_out_of_reach_is_a_problem_document(serve_people: ServePeople) -> None:

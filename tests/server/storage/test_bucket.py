@@ -101,7 +101,7 @@ def test_a_request_that_always_fails_ends_as_a_named_error(
     s3: FaultyS3, storage: Storage, operation: str, fault: Fault, named: type[StorageError]
 ) -> None:
     storage.put("file", b"bytes")
-    s3.seen.clear()
+    s3.requests.clear()
     s3.fault = lambda _: fault
     asked = storage if fault != "stall" else Storage(storage.url, patience=SHORT)
     with pytest.raises(named) as caught:
@@ -109,7 +109,7 @@ def test_a_request_that_always_fails_ends_as_a_named_error(
     assert "\n" not in str(caught.value)
     assert "Debug source" not in str(caught.value)
     # The reading of a stream counts its repetitions anew on each level, of which there are two.
-    assert 2 <= len(s3.seen) <= (RETRIES + 1) ** (2 if operation == "stream" else 1)
+    assert 2 <= len(s3.requests) <= (RETRIES + 1) ** (2 if operation == "stream" else 1)
 
 
 def test_a_bucket_that_nobody_serves_is_not_reached(monkeypatch: pytest.MonkeyPatch, s3: FaultyS3) -> None:
@@ -131,7 +131,7 @@ def test_a_large_file_goes_up_in_blocks_and_only_a_failed_block_is_sent_again(
 ) -> None:
     data = secrets.token_bytes(1 << 20) * 17  # three blocks
     (tmp_path / "large").write_bytes(data)
-    s3.seen.clear()
+    s3.requests.clear()
     failed: list[str] = []
 
     def second_block(request: Request) -> Fault:
@@ -142,9 +142,13 @@ def test_a_large_file_goes_up_in_blocks_and_only_a_failed_block_is_sent_again(
 
     s3.fault = second_block
     storage.put("large", tmp_path / "large")
-    parts = sorted(seen.path.partition("partNumber=")[2][:1] for seen in s3.seen if "partNumber" in seen.path)
+    parts = sorted(
+        request.path.partition("partNumber=")[2][:1]
+        for request in s3.requests
+        if "partNumber" in request.path
+    )
     assert parts == ["1", "2", "2", "3"]
-    assert max(int(seen.headers.get("content-length", 0)) for seen in s3.seen) == BLOCK
+    assert max(int(request.headers.get("content-length", 0)) for request in s3.requests) == BLOCK
     assert storage.get("large") == data
 
 
@@ -153,9 +157,9 @@ def test_a_stream_that_fits_into_a_block_is_one_request(s3: FaultyS3, storage: S
         for i in range(count):
             yield bytes([i]) * 1_000_000
 
-    s3.seen.clear()
+    s3.requests.clear()
     asyncio.run(storage.stream_put("small", chunks(3)))
-    assert [seen.method for seen in s3.seen] == ["PUT"]
+    assert [request.method for request in s3.requests] == ["PUT"]
     asyncio.run(storage.stream_put("large", chunks(9)))
     assert len(storage.get("large")) == 9_000_000
 
@@ -193,11 +197,11 @@ def test_a_reader_that_is_slow_gets_every_byte(s3: FaultyS3) -> None:
     storage = Storage(url, patience=Patience(block=0.5, retries=20))
 
     async def slowly() -> int:
-        seen = 0
+        count = 0
         async for piece in storage.stream_get("model"):
-            seen += len(piece)
+            count += len(piece)
             await asyncio.sleep(0.15)
-        return seen
+        return count
 
     assert asyncio.run(slowly()) == 8 << 20
 
@@ -211,12 +215,12 @@ def test_a_model_goes_to_a_slow_client_without_being_held_in_memory(s3: FaultyS3
     app.service.storage.put(layout.model_file(job_id, "model.ply"), bytes(size))
     with app.http.stream("GET", f"/v1/models/{job_id}/files/model.ply") as answer:
         pieces = answer.iter_raw()
-        seen = len(next(pieces))
+        count = len(next(pieces))
         wait_for(lambda: s3.untaken)
         # The client reads no further, and most of the file waits on the side of the bucket.
         assert s3.untaken > size / 2
         assert app.http.get("/v1/jobs").status_code == 200
-        assert seen + sum(map(len, pieces)) == size
+        assert count + sum(map(len, pieces)) == size
 
 
 SLOW = 45

@@ -59,11 +59,11 @@ def test_the_server_starts_on_what_the_first_version_stored(stored_copy: ServedA
 def test_events_logs_models_and_captures_of_the_first_version_are_served(stored_copy: ServedApp) -> None:
     http, ids = stored_copy.http, job_ids()
     done = ids["succeeded"]
-    found = follow(stored_copy, done)
-    kinds = {event["event"]["type"] for event in found}
+    records = follow(stored_copy, done)
+    kinds = {event["event"]["type"] for event in records}
     assert {"state", "plan"} <= kinds <= set(_event_types())  # the others are left out a minute after the end
     assert http.get(f"/v1/jobs/{done}/curve").json()["rows"][-1]["step"] == 60
-    assert brief(found)[-1] == "succeeded"
+    assert brief(records)[-1] == "succeeded"
     assert "usable photo" in http.get(f"/v1/jobs/{ids['failed']}/logs").json()["lines"][-1]["message"]
     model = http.get(f"/v1/models/{done}").json()
     assert (model["gaussians"], model["sh_degree"], model["name"]) == (400, 0, "succeeded")
@@ -222,10 +222,10 @@ def test_events_of_another_version_are_left_out_and_the_others_arrive(app: Serve
     ]
     app.service.reaper.tick()
     append(app, job_id, {"type": "state", "state": "failed", "problem": {"status": 5}})
-    found = follow(app, job_id)
-    assert brief(found) == ["queued", "preparing", 3, "log", "failed"]
-    for index, event in enumerate(found):
-        assert follow(app, job_id, event["id"]) == found[index + 1 :]
+    records = follow(app, job_id)
+    assert brief(records) == ["queued", "preparing", 3, "log", "failed"]
+    for index, event in enumerate(records):
+        assert follow(app, job_id, event["id"]) == records[index + 1 :]
     assert app.state(job_id) == "failed"
 
 

@@ -74,7 +74,7 @@ def check_after_return(app: ServedApp, capture_id: str, waiting: str) -> None:
         (waiting, "queued")
     ]
     assert [model["id"] for model in app.http.get("/v1/models").json()["models"]] == [MODEL]
-    assert [found["id"] for found in app.http.get("/v1/captures").json()["captures"]] == [capture_id]
+    assert [capture["id"] for capture in app.http.get("/v1/captures").json()["captures"]] == [capture_id]
     job = app.http.get(f"/v1/jobs/{MODEL}").json()
     assert (job["state"], job["name"], job["model"]) == ("succeeded", "fox", MODEL)
     assert brief(follow(app, MODEL)) == ["succeeded"]
@@ -102,7 +102,7 @@ def test_what_redis_has_lost_of_its_lists_is_listed_again(serve: Serve, tmp_path
     app = serve(redis_url=server.url)
 
     def listed(what: str) -> list[str]:
-        return [found["id"] for found in app.http.get(f"/v1/{what}").json()[what]]
+        return [record["id"] for record in app.http.get(f"/v1/{what}").json()[what]]
 
     try:
         capture = app.capture()

@@ -57,9 +57,13 @@ def test_a_redis_that_is_nearly_full_is_told_of_before_it_refuses(
     assert "raise maxmemory" in said
     monkeypatch.setenv("REDIS_URL", app.settings.redis_url)
     # A Redis of the machine may also have a version with known faults, which is another warning.
-    warned = [found for found in doctor._redis() if found.verdict == "warning" and "maxmemory" in found.seen]
+    warned = [
+        finding
+        for finding in doctor._redis()
+        if finding.verdict == "warning" and "maxmemory" in finding.result
+    ]
     assert len(warned) == 1
-    assert "(maxmemory)" in warned[0].seen
+    assert "(maxmemory)" in warned[0].result
     limit(app, 1.2)
     served, said = ready(app)
     assert not served

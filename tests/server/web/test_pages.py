@@ -144,9 +144,9 @@ def test_without_the_packages_pages_say_what_is_missing(app: ServedApp, tmp_path
 
 def test_every_page_has_a_place_for_what_all_heads_have_in_common() -> None:
     assert pages.HEAD.count(pages.IMPORT_MAP_HERE) == 1
-    found = [name for name in pages.PAGE.names() if name.endswith(".html")]
-    assert len(found) >= 6
-    for name in found:
+    names = [name for name in pages.PAGE.names() if name.endswith(".html")]
+    assert len(names) >= 6
+    for name in names:
         text = (pages.PAGE.folder / name).read_text()
         assert text.count(pages.HEAD_HERE) == 1, name
         assert '<html lang="en">' in text, name

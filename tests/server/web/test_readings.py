@@ -52,11 +52,11 @@ def test_masks_and_names_are_read_as_by_the_worker(page: Path, tmp_path: Path, l
         picture.save(tmp_path / f"{number}.png")
         masks[f"{number}.jpg"] = tmp_path / f"{number}.png"
         pictures.append(list(picture.convert("RGBA").tobytes()))
-    given = ["images/ソ表.jpg", "a/b.jpg"]
-    unmarked_zip.write(tmp_path / "set.zip", [(name.encode("cp932"), b"x") for name in given])
+    names = ["images/ソ表.jpg", "a/b.jpg"]
+    unmarked_zip.write(tmp_path / "set.zip", [(name.encode("cp932"), b"x") for name in names])
     accepted = {"mask_endings": MASK_ENDINGS, "mask_beginnings": MASK_BEGINNINGS}
     asked: dict[str, Any] = {"pictures": pictures, "accepted": accepted, "zip": str(tmp_path / "set.zip")}
     command = [*node("qr"), str(page / "program.js")]
     done = subprocess.run(command, input=json.dumps(asked), capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout) == [list(judged(masks, []).warnings), given]
+    assert json.loads(done.stdout) == [list(judged(masks, []).warnings), names]

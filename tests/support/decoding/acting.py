@@ -38,9 +38,9 @@ def acts(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 def children() -> list[int]:
     """The ids of this process's decoding processes."""
-    found = Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
+    pids = Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
     return [
         pid
-        for pid in map(int, found)
+        for pid in map(int, pids)
         if b"images.decoding.decoder" in Path(f"/proc/{pid}/cmdline").read_bytes()
     ]

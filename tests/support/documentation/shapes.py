@@ -31,14 +31,14 @@ def mismatch(shown: str, printed: str) -> str | None:
     a line `...`, which stands for any number of lines. Within a line, a number, size, duration, id or path stands for
     any other, `...` for any text, and white space for any white space.
     """
-    wanted = [line.strip() for line in shown.strip("\n").splitlines()]
+    lines = [line.strip() for line in shown.strip("\n").splitlines()]
     text = "".join(f"{line.strip()}\n" for line in printed.strip("\n").splitlines())
-    patterns = [r"(?:.*\n)*?" if line == "..." else f"{shape_of(line)}\n" for line in wanted]
+    patterns = [r"(?:.*\n)*?" if line == "..." else f"{shape_of(line)}\n" for line in lines]
     if re.fullmatch("".join(patterns), text):
         return None
-    for count in range(len(wanted), 0, -1):
+    for count in range(len(lines), 0, -1):
         if re.match("".join(patterns[: count - 1]), text) and not re.match("".join(patterns[:count]), text):
-            return f"there is no line like {wanted[count - 1]!r} where it is expected, in:\n{printed}"
+            return f"there is no line like {lines[count - 1]!r} where it is expected, in:\n{printed}"
     return f"there is more than is shown, in:\n{printed}"
 
 

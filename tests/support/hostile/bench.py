@@ -112,13 +112,13 @@ class Bench:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             try:
-                found = prepare(capture / "images", capture / "masks", capture / "work", frames=4)
+                outcome = prepare(capture / "images", capture / "masks", capture / "work", frames=4)
             except WorkerError as error:
                 return Answer(f"the job fails: `{error.code}`", error.message)
-        skipped = [f"{where}: {reason}" for where, reason in found.skipped]
-        used = [row for row in found.photos if row.name != "good.jpg" or row.mask is not None]
-        notes = [note for note in found.notes if "frames were taken" not in note]
-        notes += [warning for warning in found.warnings if "mask" in warning]
+        skipped = [f"{where}: {reason}" for where, reason in outcome.skipped]
+        used = [row for row in outcome.photos if row.name != "good.jpg" or row.mask is not None]
+        notes = [note for note in outcome.notes if "frames were taken" not in note]
+        notes += [warning for warning in outcome.warnings if "mask" in warning]
         if skipped:
             return Answer("left out", "; ".join(skipped))
         if notes:

@@ -40,7 +40,7 @@ def mutations(draw: st.DrawFn, data: bytes) -> bytes:
 def text_mutations(draw: st.DrawFn, data: bytes) -> bytes:
     """One to three changes of a valid text file: numbers become other words, or bytes change."""
     for _ in range(draw(st.integers(1, 3))):
-        numbers = [found.span() for found in _NUMBER.finditer(data)]
+        numbers = [match.span() for match in _NUMBER.finditer(data)]
         whole: bool = draw(st.booleans())
         if numbers and whole:
             start, end = draw(st.sampled_from(numbers))

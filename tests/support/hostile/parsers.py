@@ -84,8 +84,8 @@ def _colmap(stem: str, suffix: str) -> Parser:
     def files() -> dict[str, bytes]:
         if binary:
             return models.binary() | {"points3D": models.point_with_track(2) + bytes(16)}
-        found = {name: content.encode() for name, content in models.text().items()}
-        return found | {"points3D": b"1 0.5 0.5 2 255 0 0 0.1 1 0 2 0\n2 0.1 0.5 2 0 0 0 0.1 1 0\n"}
+        contents = {name: content.encode() for name, content in models.text().items()}
+        return contents | {"points3D": b"1 0.5 0.5 2 255 0 0 0.1 1 0 2 0\n2 0.1 0.5 2 0 0 0 0.1 1 0\n"}
 
     def give(bench: Bench, data: bytes) -> str:
         changed = files() | {stem: data}

@@ -58,24 +58,24 @@ def answer(make: Callable[[Path], object]) -> Answer:
     """
     with tempfile.TemporaryDirectory(prefix="splatmill-example-") as name:
         root = Path(name)
-        given, capture, work = (root / part for part in ("photos", "capture", "work"))
-        given.mkdir()
-        make(given)
+        folder, capture, work = (root / part for part in ("photos", "capture", "work"))
+        folder.mkdir()
+        make(folder)
         try:
-            found = find_files(given)
-            for file in found.files:
+            listing = find_files(folder)
+            for file in listing.files:
                 stored = capture / file.role / file.name
                 stored.parent.mkdir(parents=True, exist_ok=True)
                 stored.write_bytes(file.path.read_bytes())
             count, source, masks, said = _read(capture, work)
         except (NothingToUpload, WorkerError, ValueError, TwoDataSets) as error:
-            text = str(error).replace(f"{given}", "The folder")
+            text = str(error).replace(f"{folder}", "The folder")
             return Answer(
                 "refused", (text, *(note for each in work.glob("unpacked/*") for note in names_remark(each)))
             )
-    renamed = [f"{before!a} is stored as {after}." for before, after in found.renamed]
-    results = [f"A result of an earlier training, not a photo: {path}." for path in found.outputs]
-    remarks = tuple(dict.fromkeys((*found.remarks, *renamed, *results, *said)))
+    renamed = [f"{before!a} is stored as {after}." for before, after in listing.renamed]
+    results = [f"A result of an earlier training, not a photo: {path}." for path in listing.outputs]
+    remarks = tuple(dict.fromkeys((*listing.remarks, *renamed, *results, *said)))
     hidden = f" and {masks} masks" if masks else ""
     used = f"{count} photos{hidden}, cameras {CAMERAS[source]}."
     return Answer("used with a remark" if remarks else "used", (used, *remarks))
@@ -84,9 +84,9 @@ def answer(make: Callable[[Path], object]) -> Answer:
 def _read(capture: Path, work: Path) -> tuple[int, str, int, list[str]]:
     """Photos, source of the cameras, masks, and sentences: warnings, and why files are left out."""
     capture = zipped.data_set(capture, work)
-    given = posed.find(capture) or zipped.cameras_beside(capture, work)
-    if given is not None:
-        scene: Scene = given.load()
+    source = posed.find(capture) or zipped.cameras_beside(capture, work)
+    if source is not None:
+        scene: Scene = source.load()
         names = {view.name for view in scene.views}
         quiet = lambda *_: None  # noqa: E731
         scene = with_depth(scene, names, capture, work, TrainOptions(), quiet, lambda: False)

@@ -34,10 +34,10 @@ def spread(exact: Outputs, *kinds: Iterable[Outputs]) -> Outputs:
     """The root mean square change over each kind of samples, added as squares, and half an ulp of the value."""
     total = {k: torch.zeros_like(x) for k, x in exact.items()}
     for samples in kinds:
-        found = list(samples)
-        for sample in found:
+        outputs = list(samples)
+        for sample in outputs:
             for k, x in sample.items():
-                total[k] += (x - exact[k]) ** 2 / len(found)
+                total[k] += (x - exact[k]) ** 2 / len(outputs)
     return {k: total[k].sqrt() + U * x.abs() + TINY for k, x in exact.items()}
 
 

@@ -52,8 +52,8 @@ def _patch_once(tl: Any, interpreter: Any) -> None:
 
     def once(function: FunctionType) -> object:
         if function not in languages:
-            seen = function.__globals__.values()
-            languages[function] = [value for value in seen if value is tl or value is tl.core]
+            values = function.__globals__.values()
+            languages[function] = [value for value in values if value is tl or value is tl.core]
         fresh = any(tl.core.is_builtin(language.load) for language in languages[function])
         return search(function) if fresh else none()
 
@@ -159,9 +159,9 @@ def _call_directly(tl: Any, interpreter: Any) -> None:
     def patch(obj: Any, name: str, member: Any, builder: Any, scope: Any) -> None:
         function = getattr(member, "__wrapped__", member)
 
-        def call(*given: Any, **named: Any) -> Any:
+        def call(*positional: Any, **named: Any) -> Any:
             named["_semantic"] = semantic
-            return function(*given, **named)
+            return function(*positional, **named)
 
         scope.set_attr(obj, name, call)
 

@@ -24,7 +24,7 @@ class Launch(NamedTuple):
     """One launch: the kernel's name, and its arguments by name."""
 
     kernel: str
-    given: dict[str, Any]
+    arguments: dict[str, Any]
 
 
 class _Pause:
@@ -52,24 +52,24 @@ class WatchedKernel:
 
     def __getitem__(self, grid: Any) -> Callable[..., None]:
         def launch(*arguments: Any, **named: Any) -> None:
-            given = {**dict(zip(self.parameters, arguments, strict=False)), **named}
+            by_name = {**dict(zip(self.parameters, arguments, strict=False)), **named}
             with looking_away():
                 self.kernel[grid](*arguments, **named)
                 chosen = getattr(self.kernel, "best_config", None)
-                self._told(Launch(self.name, {**given, **(chosen.kwargs if chosen is not None else {})}))
+                self._told(Launch(self.name, {**by_name, **(chosen.kwargs if chosen is not None else {})}))
 
         return launch
 
 
 def watch(monkeypatch: pytest.MonkeyPatch, told: Callable[[Launch], None]) -> dict[str, Any]:
     """Have every kernel of the package tell of its launches; returns the kernels themselves by name."""
-    found: dict[str, Any] = {}
+    kernels: dict[str, Any] = {}
     names = [each.name for each in pkgutil.walk_packages(gpu.__path__, f"{gpu.__name__}.")]
     for module in [importlib.import_module(name) for name in names]:
         for name in [name for name in vars(module) if name.endswith("_kernel")]:
-            found[name] = getattr(module, name)
-            monkeypatch.setattr(module, name, WatchedKernel(name, found[name], told))
-    return found
+            kernels[name] = getattr(module, name)
+            monkeypatch.setattr(module, name, WatchedKernel(name, kernels[name], told))
+    return kernels
 
 
 WAITING_METHODS = frozenset(

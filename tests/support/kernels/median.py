@@ -31,7 +31,7 @@ def fields_of(case: Case) -> tuple[Projected, Bins, Tensor]:
     return projected, bins, 0.02 * random
 
 
-def agrees(name: str, case: Case, found: Tensor, projected: Projected, bins: Bins, tilts: Tensor) -> None:
+def agrees(name: str, case: Case, depth: Tensor, projected: Projected, bins: Bins, tilts: Tensor) -> None:
     """Assert that every pixel shows one of the splats that the errors of alpha allow, at the depth of its plane."""
     exact = Projected(*(field.double() for field in projected))
     error = record_error(
@@ -47,7 +47,7 @@ def agrees(name: str, case: Case, found: Tensor, projected: Projected, bins: Bin
             torch.arange(top, min(top + TILE, case.height)),
             torch.arange(left, min(left + TILE, case.width)),
         )
-        shown = found[ys[0] : ys[-1] + 1, xs[0] : xs[-1] + 1].double().reshape(-1)
+        shown = depth[ys[0] : ys[-1] + 1, xs[0] : xs[-1] + 1].double().reshape(-1)
         if not len(ids):
             assert (shown == 0).all()
             continue
@@ -78,4 +78,4 @@ def agrees(name: str, case: Case, found: Tensor, projected: Projected, bins: Bin
         at_most("median depth", name, torch.where(none, 0.0, off), 1.0)
         undecided += int((possible.sum(1) + (~late[:, -1]) > 1).sum())
     if not name.startswith(("pile", "long needles")):
-        assert undecided < 0.05 * found.numel()
+        assert undecided < 0.05 * depth.numel()

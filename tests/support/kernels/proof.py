@@ -28,10 +28,10 @@ def backends() -> list[object]:
     Triton's interpreter needs minutes for what takes a device seconds: it is proven on a few scenes by test_gpu_ops,
     and on all of these where SPLATMILL_PROVE_INTERPRETER=1 asks for it.
     """
-    found: list[object] = [f"cpu:{name}" for name in isa.supported()]
+    choices: list[object] = [f"cpu:{name}" for name in isa.supported()]
     if torch.cuda.is_available() or os.environ.get("SPLATMILL_PROVE_INTERPRETER") == "1":
-        found.append(pytest.param("gpu", marks=pytest.mark.gpu))
-    return found
+        choices.append(pytest.param("gpu", marks=pytest.mark.gpu))
+    return choices
 
 
 def where(op: str) -> str:
@@ -134,8 +134,8 @@ def alpha_error(case: Case, exact: Projected) -> Tensor:
     """
     coordinate = 4 * EPS * (case.means.double().abs().sum(1) + case.viewmat[:3, 3].double().abs().sum())
     z = exact.depths.detach()
-    seen = (exact.extents > 0).all(1)
-    z = torch.where(seen, z, 1.0)
+    visible = (exact.extents > 0).all(1)
+    z = torch.where(visible, z, 1.0)
     focal = float(case.K[0, 0].maximum(case.K[1, 1]))
     offset = (exact.means2d.detach() - case.K[:2, 2].double()).abs().amax(1) / focal
     pixels = focal * coordinate / z * (1 + offset) + 2 * EPS * exact.means2d.detach().abs().amax(1)
@@ -143,7 +143,7 @@ def alpha_error(case: Case, exact: Projected) -> Tensor:
     stiffest = (a + c) / 2 + torch.sqrt(((a - c) / 2) ** 2 + b * b)
     q = 11.0
     error = torch.sqrt(q * stiffest) * pixels + q / 2 * (2 * coordinate / z + 16 * EPS) + ALPHA_ERROR
-    return torch.where(seen, error, 0.0)
+    return torch.where(visible, error, 0.0)
 
 
 def conditioning(p: Projected) -> Tensor:
@@ -154,8 +154,8 @@ def conditioning(p: Projected) -> Tensor:
     """
     a, b, c = p.conics.detach().double().unbind(1)
     det = a * c - b * b
-    seen = (p.extents > 0).all(1)
-    return torch.where(seen, torch.where(det > 0, a * c / det, torch.inf), 1.0)
+    visible = (p.extents > 0).all(1)
+    return torch.where(visible, torch.where(det > 0, a * c / det, torch.inf), 1.0)
 
 
 def record_error(p: Projected) -> Tensor:
@@ -167,8 +167,8 @@ def record_error(p: Projected) -> Tensor:
     q grows there by 2 Q / extent for each pixel. The functions and the sum of the exponent add ALPHA_ERROR.
     """
     k = conditioning(p)
-    seen = (p.extents > 0).all(1)
-    off = torch.where(seen[:, None], p.means2d.double().abs() / p.extents.double(), 0.0).amax(1)
+    visible = (p.extents > 0).all(1)
+    off = torch.where(visible[:, None], p.means2d.double().abs() / p.extents.double(), 0.0).amax(1)
     q = 2 * math.log(1 / ALPHA_MIN)
     return EPS * q * (k + 8 * torch.sqrt(k) + 4 + 2 * (1 + off)) + ALPHA_ERROR
 

@@ -91,9 +91,10 @@ def units(case: Case, want: Run, weights: Weights) -> Units:
     ]
     between = squares(passed_on() for _ in range(DRAWS))
 
-    def rooted(found: list[Outputs]) -> Outputs:
+    def rooted(variances: list[Outputs]) -> Outputs:
         return {
-            k: torch.stack([p[k] for p in found]).sum(0).sqrt() + U * x.abs() + TINY for k, x in exact.items()
+            k: torch.stack([p[k] for p in variances]).sum(0).sqrt() + U * x.abs() + TINY
+            for k, x in exact.items()
         }
 
     return Units(rooted(parts), rooted([*parts, between]))
@@ -120,8 +121,8 @@ def _drawn(
 
 
 def _gradients(total: Tensor, alive: dict[str, Tensor]) -> Outputs:
-    found = torch.autograd.grad(total, list(alive.values()), allow_unused=True)
-    pairs = zip(alive.items(), found, strict=True)
+    gradients = torch.autograd.grad(total, list(alive.values()), allow_unused=True)
+    pairs = zip(alive.items(), gradients, strict=True)
     return {k: torch.zeros_like(x) if grad is None else grad for (k, x), grad in pairs}
 
 

@@ -12,9 +12,9 @@ def violations(page: Page) -> list[str]:
     page.evaluate((npm_package("axe-core") / "axe.min.js").read_text(encoding="utf-8"))
     result: dict[str, Any] = page.evaluate("axe.run(document)")
     assert len(result["passes"]) > 10, "it has looked at the page"
-    found = result["violations"]
+    rules = result["violations"]
     return [
         f"{rule['id']}: {[node['target'] for node in rule['nodes']]}"
-        for rule in found
+        for rule in rules
         if rule["impact"] in ("serious", "critical")
     ]

@@ -136,46 +136,46 @@ ALWAYS = {
 
 def factors() -> dict[str, dict[str, Forced]]:
     """Every decision, by the name of its field. Switches, flags and choices are found by their types."""
-    found = dict(NAMED)
+    levels = dict(NAMED)
     known = {*NAMED, *ELSEWHERE, *NO_DECISION}
     for name, option in TrainOptions.model_fields.items():
         kind = option.annotation
         if name in known:
             continue
         if kind is bool:
-            found[name] = _by_option(name, True, False)
+            levels[name] = _by_option(name, True, False)
         elif isinstance(kind, type) and issubclass(kind, StrEnum):
-            found[name] = _by_option(name, *(choice.value for choice in kind if choice.value != "auto"))
+            levels[name] = _by_option(name, *(choice.value for choice in kind if choice.value != "auto"))
         else:
             raise AssertionError(f"The option {name} is new here: name its levels in NAMED.")
     for name, kind in _fields_of_plan().items():
-        if name in found or name in known:
+        if name in levels or name in known:
             continue
         if kind is bool:
-            found[name] = _by_plan(name, on=True, off=False)
+            levels[name] = _by_plan(name, on=True, off=False)
         elif get_origin(kind) is Literal:
-            found[name] = _by_plan(name, **{str(value): value for value in get_args(kind)})
+            levels[name] = _by_plan(name, **{str(value): value for value in get_args(kind)})
         else:
             raise AssertionError(f"The field {name} of the plan is new here: name its levels in NAMED.")
     # The reference last: a row has it only where that adds a pair, since it is slow.
-    found["backend"] = {name: found["backend"][name] for name in ("cpu", "gpu", "reference")}
+    levels["backend"] = {name: levels["backend"][name] for name in ("cpu", "gpu", "reference")}
     if absence() is not None:
-        del found["backend"]["gpu"]
-    return found
+        del levels["backend"]["gpu"]
+    return levels
 
 
 def refused(known: Mapping[str, Mapping[str, Forced]]) -> set[Pair]:
     """The pairs that a run refuses: without points there is nothing to seed or to compare, and not all kernels cull."""
-    found = {
+    pairs = {
         frozenset(((name, "on"), ("initial", initial)))
         for name in ("far_shell", "gaps")
         for initial in ("hull", "random", "model")
     } | {frozenset((("exposure", "on"), ("initial", initial))) for initial in ("hull", "random")}
     for backend in {"gpu", "reference"} & set(known["backend"]):
-        found.add(frozenset((("cluster_culling", "on"), ("backend", backend))))
+        pairs.add(frozenset((("cluster_culling", "on"), ("backend", backend))))
     if "gpu" in known["backend"]:
-        found.add(frozenset((("pose_refinement", "on"), ("backend", "gpu"))))
-    return found
+        pairs.add(frozenset((("pose_refinement", "on"), ("backend", "gpu"))))
+    return pairs
 
 
 def revised(plan: Plan, changes: Mapping[str, Any]) -> Plan:

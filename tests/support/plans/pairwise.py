@@ -30,7 +30,7 @@ def covering(factors: Mapping[str, Sequence[str]], excluded: Collection[Pair]) -
     where a combination cannot be completed without an excluded pair.
     """
     missing = pairs(factors) - set(excluded)
-    found = []
+    rows = []
     while missing:
         chosen = dict(min(missing, key=sorted))
         for factor in sorted(factors, key=lambda name: -len(factors[name])):
@@ -45,8 +45,8 @@ def covering(factors: Mapping[str, Sequence[str]], excluded: Collection[Pair]) -
                 raise ValueError(f"No level of {factor} may stand beside {chosen}.")
             chosen[factor] = max(allowed, key=lambda level: len(missing & _with(chosen, factor, level)))
         missing -= {frozenset(pair) for pair in combinations(chosen.items(), 2)}
-        found.append(chosen)
-    return found
+        rows.append(chosen)
+    return rows
 
 
 def _with(chosen: Mapping[str, str], factor: str, level: str) -> set[Pair]:

@@ -79,8 +79,8 @@ def off_surface(points: Float, cameras: dict[str, Camera]) -> Float:
     least = np.full(len(points), np.inf)
     for camera in cameras.values():
         depth = photograph(still_life(0), camera, samples=1)[1].astype(np.float64)
-        seen = camera.project(points)
-        rows = np.flatnonzero(seen.inside)
-        true = depth[seen.rows[rows].astype(int), seen.columns[rows].astype(int)]
-        least[rows] = np.minimum(least[rows], np.abs(seen.depths[rows] / true - 1.0))
+        projection = camera.project(points)
+        rows = np.flatnonzero(projection.inside)
+        true = depth[projection.rows[rows].astype(int), projection.columns[rows].astype(int)]
+        least[rows] = np.minimum(least[rows], np.abs(projection.depths[rows] / true - 1.0))
     return least

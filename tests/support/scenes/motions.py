@@ -82,8 +82,8 @@ def model_of(
         lens = pycolmap.Camera(model="OPENCV", width=WIDTH, height=HEIGHT, params=params)
         pixels = lens.img_from_cam(local, False)
         pixels += rng.normal(0, 0.33, (POINTS, 2))
-        seen = np.flatnonzero(((pixels > 0) & (pixels < [WIDTH, HEIGHT])).all(1) & (local[:, 2] > 0))
-        keep = rng.permutation(seen)[:observed]
+        inside = np.flatnonzero(((pixels > 0) & (pixels < [WIDTH, HEIGHT])).all(1) & (local[:, 2] > 0))
+        keep = rng.permutation(inside)[:observed]
         image = pycolmap.Image(
             name=f"{number:06d}.png",
             keypoints=pixels[keep],

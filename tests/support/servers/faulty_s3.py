@@ -36,14 +36,14 @@ class FaultyS3:
     """The proxy.
 
     storage: the address of a folder in the bucket, for `Storage`.
-    seen: the requests so far.
+    requests: the requests so far.
     fault: chooses what happens to a request.
     stalled: number of requests that are held up.
     half: chooses how many bytes of the body of an answer are passed on before the connection is cut, or None: all.
     """
 
     storage: str = ""
-    seen: list[Request] = field(default_factory=list)
+    requests: list[Request] = field(default_factory=list)
     fault: Callable[[Request], Fault] = lambda _: None
     half: Callable[[Request], int | None] = lambda _: None
     stalled: int = 0
@@ -55,7 +55,7 @@ class FaultyS3:
     def reset(self) -> None:
         """Spoil nothing from now on, and forget what was seen."""
         self.release()
-        self.fault, self.half, self.seen = (lambda _: None), (lambda _: None), []
+        self.fault, self.half, self.requests = (lambda _: None), (lambda _: None), []
 
     @property
     def untaken(self) -> int:
@@ -102,7 +102,7 @@ class FaultyS3:
             headers = {name.lower(): value.strip() for name, value in pairs}
             body = await reader.readexactly(int(headers.get("content-length", 0)))
             request = Request(method, path, headers)
-            self.seen.append(request)
+            self.requests.append(request)
             fault = self.fault(request)
             if fault in ("stall", "wait"):
                 self.stalled += 1

@@ -10,8 +10,8 @@ from splatmill.backplane.queue.lines import LINES, Line
 
 def waiting(connection: redis.Redis) -> int:
     """Return how many entries wait."""
-    found = lines.look(connection)
-    counted = sum(found.count(line) for line in LINES)
+    entries = lines.look(connection)
+    counted = sum(entries.count(line) for line in LINES)
     assert counted == connection.hlen(keys.PLACES)
     return counted
 

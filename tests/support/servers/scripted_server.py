@@ -11,7 +11,7 @@ from splatmill.sdk.loop import BackgroundLoop
 
 
 @dataclass
-class Seen:
+class Request:
     """A request that reached the server."""
 
     method: str
@@ -46,15 +46,15 @@ class Reply:
 
 @dataclass
 class ScriptedServer:
-    """The server: `answer` makes the response to a request, `seen` are the requests so far.
+    """The server: `answer` makes the response to a request, `requests` are the requests so far.
 
     left: number of clients that closed their connection before the whole response was sent.
     """
 
     url: str = ""
-    seen: list[Seen] = field(default_factory=list)
+    requests: list[Request] = field(default_factory=list)
     left: int = 0
-    answer: Callable[[Seen], Reply | Awaitable[Reply]] = lambda _: Reply()
+    answer: Callable[[Request], Reply | Awaitable[Reply]] = lambda _: Reply()
 
     def script(self, *replies: Reply) -> None:
         """Answer with these responses, one after another."""
@@ -71,8 +71,8 @@ class ScriptedServer:
         except (asyncio.IncompleteReadError, ConnectionError):
             writer.close()  # it was closed before there was a whole request
             return
-        request = Seen(method, path, headers, body)
-        self.seen.append(request)
+        request = Request(method, path, headers, body)
+        self.requests.append(request)
         answer = self.answer(request)
         try:
             reply = await answer if isinstance(answer, Awaitable) else answer

@@ -29,13 +29,13 @@ def follow(app: ServedApp, job_id: str, after: str | None = None) -> list[dict[s
             return []
         assert answer.status_code == 200
         assert answer.headers["content-type"].startswith("text/event-stream")
-        found = [m for m in messages(answer.iter_lines()) if "data" in m]
-    for message in found:
+        events = [m for m in messages(answer.iter_lines()) if "data" in m]
+    for message in events:
         record = EventRecord.model_validate_json(message["data"])
         assert (record.id, record.event.type) == (message["id"], message["event"])
-    return [json.loads(m["data"]) for m in found]
+    return [json.loads(m["data"]) for m in events]
 
 
-def brief(found: list[dict[str, Any]]) -> list[Any]:
+def brief(records: list[dict[str, Any]]) -> list[Any]:
     """Return the state, the number of units done, or else the type of each event."""
-    return [e["event"].get("state") or e["event"].get("done") or e["event"]["type"] for e in found]
+    return [e["event"].get("state") or e["event"].get("done") or e["event"]["type"] for e in records]

@@ -36,18 +36,18 @@ def striped(fx: float, fy: float, phase: float, centre: tuple[float, float]) -> 
 @pytest.mark.parametrize(("fx", "fy"), [(0.1875, 0.0), (0.125, -0.25), (0.0, 0.3125), (0.21, 0.1)])
 def test_a_wave_begins_as_that_which_is_missing(fx: float, fy: float) -> None:
     centre = (31.3, 29.8)
-    _, found = strongest(spots(centre), striped(fx, fy, 0.1, centre))
+    _, waves = strongest(spots(centre), striped(fx, fy, 0.1, centre))
     # Frequencies are searched in steps of 1/32 cycles per pixel.
-    assert torch.allclose(found[0, :2], torch.tensor([fx, fy]), atol=1 / 64 + 1e-6)
+    assert torch.allclose(waves[0, :2], torch.tensor([fx, fy]), atol=1 / 64 + 1e-6)
     if max(fx * 32 % 1, fy * 32 % 1) == 0:
         # The phase may be half a turn off, with the amplitude's sign changed.
-        turned = torch.cos(2 * math.pi * (found[0, 2] - 0.1))
+        turned = torch.cos(2 * math.pi * (waves[0, 2] - 0.1))
         assert float(turned.abs()) == pytest.approx(1.0, abs=1e-3)
         # Least squares through the alpha: the sum of alpha times the residual over that of alpha squared.
         d = torch.arange(-15, 16).float()
         alpha = 0.8 * torch.exp(-(d[:, None] ** 2 + d[None, :] ** 2) / 32)
         ratio = float(alpha.sum() / alpha.square().sum())
-        assert torch.allclose(found[0, 3:] * turned, gabor.GAIN * ratio * AMPLITUDE, rtol=0.1)
+        assert torch.allclose(waves[0, 3:] * turned, gabor.GAIN * ratio * AMPLITUDE, rtol=0.1)
 
 
 def test_waves_go_where_one_explains_most() -> None:

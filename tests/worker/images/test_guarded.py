@@ -103,8 +103,8 @@ def test_a_mask_much_larger_than_its_photo_is_refused(
 @pytest.mark.filterwarnings("ignore")  # Pillow says that the tags are damaged
 def test_damaged_exif_leaves_the_photo_usable(tmp_path: Path) -> None:
     write(tmp_path / "a.jpg", pictures.with_exif(pictures.turned_with_rubbish()))
-    found = prepare(tmp_path, None, tmp_path.with_name("work"))
-    assert [(photo.width, photo.height) for photo in found.photos] == [(48, 64)]
+    result = prepare(tmp_path, None, tmp_path.with_name("work"))
+    assert [(photo.width, photo.height) for photo in result.photos] == [(48, 64)]
     assert decode.decode(tmp_path / "a.jpg").size == (48, 64)
 
 
@@ -114,9 +114,9 @@ def test_of_several_pictures_in_a_file_the_first_is_used_and_a_note_says_so(tmp_
     for first, name, form in zip(firsts, ("a.webp", "b.tif", "c.png"), ("WEBP", "TIFF", "PNG"), strict=True):
         data = pictures.encoded(first, form, save_all=True, append_images=[second])
         write(tmp_path / name, data)
-    found = prepare(tmp_path, None, tmp_path.with_name("work"))
-    assert len(found.photos) == 3
-    assert found.notes == tuple(
+    result = prepare(tmp_path, None, tmp_path.with_name("work"))
+    assert len(result.photos) == 3
+    assert result.notes == tuple(
         f"{n} holds several pictures; the first one is used." for n in ("a.webp", "b.tif", "c.png")
     )
     assert decode.decode(tmp_path / "b.tif").tobytes() == firsts[1].tobytes()

@@ -32,20 +32,20 @@ def disc(width: int, height: int, x: float, y: float, radius: float) -> Grey:
     ],
 )
 def test_a_circle_is_found_where_it_is(width: int, height: int, x: float, y: float, radius: float) -> None:
-    found = circle_in(disc(width, height, x, y, radius))
-    assert found is not None
-    assert found.x * width == pytest.approx(x, abs=0.5)
-    assert found.y * height == pytest.approx(y, abs=0.5)
-    assert found.radius * max(width, height) == pytest.approx(radius, abs=1.0)
+    circle = circle_in(disc(width, height, x, y, radius))
+    assert circle is not None
+    assert circle.x * width == pytest.approx(x, abs=0.5)
+    assert circle.y * height == pytest.approx(y, abs=0.5)
+    assert circle.radius * max(width, height) == pytest.approx(radius, abs=1.0)
 
 
 def test_what_a_lamp_throws_onto_the_frame_and_dark_parts_at_the_rim_do_not_move_it() -> None:
     grey = disc(320, 320, 160, 160, 150)
     grey[:40, 150:170] = 90
     grey[200:215, 280:312] = 5
-    found = circle_in(grey)
-    assert found is not None
-    assert found.radius * 320 == pytest.approx(150, abs=1.5)
+    circle = circle_in(grey)
+    assert circle is not None
+    assert circle.radius * 320 == pytest.approx(150, abs=1.5)
 
 
 def vignette() -> Grey:

@@ -88,13 +88,13 @@ def test_unusable_files_are_named_with_their_reason(photos: Path, tmp_path: Path
     (photos / "notes.txt").write_text("hello")
     result = prepared(photos, tmp_path)
     assert [photo.name for photo in result.photos] == ["good.jpg"]
-    found = reasons(result)
-    assert found.keys() == {"same.jpg", "text.jpg", "empty.png", "cut.jpg", "one.png", "notes.txt"}
-    assert "good.jpg" in found["same.jpg"]
-    assert "not an image" in found["text.jpg"]
-    assert "empty" in found["empty.png"]
-    assert "does not decode completely" in found["cut.jpg"]
-    assert "too small" in found["one.png"]
+    skipped = reasons(result)
+    assert skipped.keys() == {"same.jpg", "text.jpg", "empty.png", "cut.jpg", "one.png", "notes.txt"}
+    assert "good.jpg" in skipped["same.jpg"]
+    assert "not an image" in skipped["text.jpg"]
+    assert "empty" in skipped["empty.png"]
+    assert "does not decode completely" in skipped["cut.jpg"]
+    assert "too small" in skipped["one.png"]
 
 
 def test_a_link_is_named_and_its_target_not_read(photos: Path, tmp_path: Path) -> None:
@@ -109,10 +109,10 @@ def test_files_that_are_neither_used_nor_skipped_are_a_failure(
     photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def expand(
-        name: str, path: Path, inside: object, workdir: Path, frames: int, found: Any, _: object
+        name: str, path: Path, inside: object, workdir: Path, frames: int, listing: Any, _: object
     ) -> None:
         if name != "b.png":
-            found.files.append((name, path, None))
+            listing.files.append((name, path, None))
 
     for seed, name in enumerate(("a.png", "b.png")):
         picture(seed=seed).save(photos / name)
@@ -256,10 +256,10 @@ def test_undistortion_makes_straight_lines_straight(tmp_path: Path) -> None:
     x = (np.arange(160) + 0.5 - at.cx) / at.fx
     y = (np.arange(120) + 0.5 - at.cy) / at.fy
     expected = pattern(*np.meshgrid(x, y))
-    seen = photo.mask if photo.mask is not None else np.ones(expected.shape, bool)
-    assert seen.mean() > 0.98
+    mask = photo.mask if photo.mask is not None else np.ones(expected.shape, bool)
+    assert mask.mean() > 0.98
     # 8-bit rounding plus what averaging a sine over a pixel of 0.0067 radians takes away: under 1 of 255.
-    assert np.abs(photo.rgb[:, :, 0] - expected)[seen].max() < 2.0
+    assert np.abs(photo.rgb[:, :, 0] - expected)[mask].max() < 2.0
 
 
 def test_a_photo_of_another_shape_than_its_camera_is_refused(tmp_path: Path) -> None:

@@ -81,12 +81,12 @@ def test_a_pixel_of_the_undistorted_photo_is_where_the_lens_puts_its_ray(
     u, v = (grid.ravel() for grid in np.meshgrid(np.linspace(0, W, 41), np.linspace(0, H, 31)))
     x, y = camera.normalized(u, v)
     pixels = lens.distort(own, np.stack([x, y, np.ones_like(x)], axis=1))
-    seen = pixels[:, 0] > lens.NOWHERE / 2
-    assert seen.mean() > 0.9
-    bent_x, bent_y = equations(x[seen], y[seen], *extra)
+    visible = pixels[:, 0] > lens.NOWHERE / 2
+    assert visible.mean() > 0.9
+    bent_x, bent_y = equations(x[visible], y[visible], *extra)
     expected = np.stack([focal[0] * bent_x + 243.0, focal[-1] * bent_y + 178.0], axis=1)
     # An angle in radians is a distance in pixels over the focal length.
-    assert np.abs(pixels[seen] - expected).max() / min(focal) < 1e-6
+    assert np.abs(pixels[visible] - expected).max() / min(focal) < 1e-6
 
 
 @pytest.mark.parametrize(("model", "focal", "extra", "equations"), LENSES)

@@ -44,10 +44,10 @@ def test_positions_do_not_depend_on_the_size_of_a_band(band: int, monkeypatch: p
     whole = look_ups.of(lens(40), CAMERA, 3)
     look_ups.forget()
     monkeypatch.setattr(look_ups, "BAND", band)
-    grid, seen = look_ups.of(lens(40), CAMERA, 3)
+    grid, visible = look_ups.of(lens(40), CAMERA, 3)
     np.testing.assert_array_equal(grid, whole[0])
-    np.testing.assert_array_equal(seen, whole[1])
-    assert 0 < int(seen.sum()) < seen.numel()
+    np.testing.assert_array_equal(visible, whole[1])
+    assert 0 < int(visible.sum()) < visible.numel()
     # The middle of the photo is the middle of the pinhole's, and all of a row is at its height but for the distortion.
     np.testing.assert_allclose(grid[71:73, 95:97].mean(dim=(0, 1)), 0.0, atol=1e-6)
 

@@ -48,15 +48,15 @@ def test_masks_among_the_photos_are_used_and_counted(tmp_path: Path, form: str) 
         photo(tmp_path / f"images/{number}.png", number)
         if number:
             mask(tmp_path / form.format(number), 0.25)
-    found = prepared(tmp_path)
-    assert [one.name for one in found.photos] == [f"{number}.png" for number in range(4)]
-    assert [one.mask for one in found.photos] == [
+    result = prepared(tmp_path)
+    assert [one.name for one in result.photos] == [f"{number}.png" for number in range(4)]
+    assert [one.mask for one in result.photos] == [
         None,
         *(tmp_path / form.format(number) for number in (1, 2, 3)),
     ]
-    assert found.skipped == ()
-    assert found.notes == ("3 of 4 photos have a mask; the masks hide 25% of their pixels.",)
-    assert found.warnings == ()
+    assert result.skipped == ()
+    assert result.notes == ("3 of 4 photos have a mask; the masks hide 25% of their pixels.",)
+    assert result.warnings == ()
 
 
 @pytest.mark.parametrize("masked", ["0.png", "0 copy.png"])
@@ -67,10 +67,10 @@ def test_of_two_files_of_one_photo_that_with_the_short_name_is_used_with_the_mas
         photo(tmp_path / f"images/{number}.png", number)
     shutil.copy(tmp_path / "images/0.png", tmp_path / "images/0 copy.png")
     mask(tmp_path / "masks" / masked, 0.25)
-    found = prepared(tmp_path, "masks")
-    assert [one.name for one in found.photos] == ["0.png", "1.png", "2.png"]
-    assert [one.mask for one in found.photos] == [tmp_path / "masks" / masked, None, None]
-    assert found.skipped == (("0 copy.png", "its content is the same as that of 0.png"),)
+    result = prepared(tmp_path, "masks")
+    assert [one.name for one in result.photos] == ["0.png", "1.png", "2.png"]
+    assert [one.mask for one in result.photos] == [tmp_path / "masks" / masked, None, None]
+    assert result.skipped == (("0 copy.png", "its content is the same as that of 0.png"),)
 
 
 def test_masks_with_other_suffixes_in_their_folder(tmp_path: Path) -> None:
@@ -146,13 +146,13 @@ def test_masks_of_two_labels_show_the_higher_one(
     _labelled(tmp_path, mask_of, suffix)
     named = [] if levels is None else [f"The masks have the levels {levels[0]} and {levels[1]} of 255 alone"]
     named += ["1 mask hides all of a photo"] if mask_of(0).getextrema() == (0, 0) else []
-    found = prepared(tmp_path, "masks")
-    given = posed.find(tmp_path)
-    assert given is not None
-    scene = given.load()
-    assert [text.split(",")[0].split(":")[0] for text in found.warnings] == named
+    result = prepared(tmp_path, "masks")
+    poses = posed.find(tmp_path)
+    assert poses is not None
+    scene = poses.load()
+    assert [text.split(",")[0].split(":")[0] for text in result.warnings] == named
     assert [text.split(",")[0].split(":")[0] for text in scene.warnings] == named
-    for view, one in zip(scene.views, found.photos, strict=True):
+    for view, one in zip(scene.views, result.photos, strict=True):
         loaded = load_view(view, 64).mask
         assert loaded is not None
         hidden = 64 if len(named) == 2 and view.name == "0.jpg" else 16
@@ -172,9 +172,9 @@ def test_masks_of_two_labels_show_the_higher_one(
 @pytest.mark.parametrize(("low", "high", "span"), [(0, 0, "0"), (1, 1, "1")])
 def test_masks_that_hide_everything_are_refused(tmp_path: Path, low: int, high: int, span: str) -> None:
     _labelled(tmp_path, _drawn(low, high))
-    given = posed.find(tmp_path)
-    assert given is not None
-    for load in (given.load, lambda: prepared(tmp_path, "masks")):
+    poses = posed.find(tmp_path)
+    assert poses is not None
+    for load in (poses.load, lambda: prepared(tmp_path, "masks")):
         with pytest.raises(Refusal, match=f"all pixels of all 3 photos: their levels are {span} of 255"):
             load()
 
@@ -196,9 +196,9 @@ def test_masks_of_photos_with_cameras(tmp_path: Path, place: str) -> None:
         mask(tmp_path / place.format(number), 0.875)
     mask(tmp_path / "masks/other.png", 0.25)
     transforms(tmp_path / "transforms.json", frames(["0.jpg", "1.jpg", "2.jpg"]))
-    given = posed.find(tmp_path)
-    assert given is not None
-    scene = given.load()
+    poses = posed.find(tmp_path)
+    assert poses is not None
+    scene = poses.load()
     assert [view.mask for view in scene.views] == [tmp_path / place.format(number) for number in range(3)]
     assert scene.left_out == ()
     assert "3 of 3 photos have a mask; the masks hide 88% of their pixels." in scene.notes
@@ -235,10 +235,10 @@ def test_pictures_in_the_folder_of_masks_are_refused_as_previews_of_masks(
         photo(tmp_path / "images" / name, number)
         photo(tmp_path / "masks" / name, number + 10)
     transforms(tmp_path / "transforms.json", frames(names))
-    given = posed.find(tmp_path)
-    assert given is not None
+    poses = posed.find(tmp_path)
+    assert poses is not None
     with pytest.raises(Refusal) as refused:
-        given.load() if posed_too else prepared(tmp_path, "masks")
+        poses.load() if posed_too else prepared(tmp_path, "masks")
     assert refused.value.code == "no_images"
     assert "are neither black nor white" in str(refused.value)
 

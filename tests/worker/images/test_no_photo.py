@@ -98,9 +98,9 @@ def test_a_depth_map_among_photos_is_left_out(tmp_path: Path) -> None:
         Image.fromarray(rgb).save(tmp_path / "images" / f"{k}.jpg")
         depth(k).save(tmp_path / "images" / f"{k}_d.png")
         labels(k).save(tmp_path / "images" / "confidence" / f"{k}.png")
-    found = prepare(tmp_path / "images", None, tmp_path / "work")
-    assert [photo.name for photo in found.photos] == [f"{k}.jpg" for k in range(4)]
-    reasons = dict(found.skipped)
+    result = prepare(tmp_path / "images", None, tmp_path / "work")
+    assert [photo.name for photo in result.photos] == [f"{k}.jpg" for k in range(4)]
+    reasons = dict(result.skipped)
     assert reasons["2_d.png"] == (
         "it has a single channel of 16 bits, as depth maps have, which other photos have not"
     )

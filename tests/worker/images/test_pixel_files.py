@@ -81,8 +81,8 @@ def test_photos_outlive_their_room_and_leave_no_file(tmp_path: Path) -> None:
     kept = [files.placed(values + np.uint8(each)) for each in range(5)]
     assert not list(tmp_path.iterdir())
     del files
-    for each, found in enumerate(kept):
-        assert np.array_equal(found, values + np.uint8(each))
+    for each, photo in enumerate(kept):
+        assert np.array_equal(photo, values + np.uint8(each))
 
 
 def test_a_full_disk_is_an_error(tmp_path: Path) -> None:
@@ -100,11 +100,11 @@ def test_a_full_disk_is_an_error(tmp_path: Path) -> None:
 def resident(values: torch.Tensor) -> float:
     """The share of the pages of a tensor, which begins with a page, that are in memory (mincore)."""
     pages = -(-values.nbytes // mmap.PAGESIZE)
-    found = (ctypes.c_ubyte * pages)()
+    flags = (ctypes.c_ubyte * pages)()
     system = ctypes.CDLL(None, use_errno=True)
     address = ctypes.c_void_p(values.data_ptr())
-    assert system.mincore(address, ctypes.c_size_t(values.nbytes), found) == 0, ctypes.get_errno()
-    return sum(each & 1 for each in found) / pages
+    assert system.mincore(address, ctypes.c_size_t(values.nbytes), flags) == 0, ctypes.get_errno()
+    return sum(each & 1 for each in flags) / pages
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="pages are written out by an advice of Linux")
@@ -164,7 +164,7 @@ def test_photos_in_files_take_no_memory(tmp_path: Path) -> None:
     """194 MB of photos, which take as much in memory, and leave nothing in the heap."""
     random = np.random.default_rng(0)
     Image.fromarray(random.integers(256, size=(900, 1200, 3), dtype=np.uint8)).save(tmp_path / "one.jpg")
-    found = {}
+    figures = {}
     for place in ("memory", "files"):
         done = subprocess.run(
             [sys.executable, "-c", MEASURED, str(tmp_path), place],
@@ -173,8 +173,8 @@ def test_photos_in_files_take_no_memory(tmp_path: Path) -> None:
             check=True,
             env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
         )
-        found[place] = json.loads(done.stdout)
-    (held, size, total), (taken, filed, same) = found["memory"], found["files"]
+        figures[place] = json.loads(done.stdout)
+    (held, size, total), (taken, filed, same) = figures["memory"], figures["files"]
     assert size == filed == 60 * 3 * 1200 * 900
     assert total == same
     assert held > 0.9 * size

@@ -39,23 +39,23 @@ def written(capture: Path, count: int = 3) -> Path:
 def test_photos_are_read_back_where_the_capture_lies_now(tmp_path: Path) -> None:
     capture, work, out = written(tmp_path / "here"), tmp_path / "work", tmp_path / "out"
     out.mkdir()
-    found = prepare(capture / "images", capture / "masks", work)
+    prepared = prepare(capture / "images", capture / "masks", work)
     made = work / "overlays" / "1.png"
     made.parent.mkdir(parents=True)
-    shutil.copyfile(found.photos[0].mask or Path(), made)
-    one, two, three = found.photos
+    shutil.copyfile(prepared.photos[0].mask or Path(), made)
+    one, two, three = prepared.photos
     tags = Exif(make="M", focal_length=4.2, latitude=-0.0, longitude=1e-9)
-    given = replace(
-        found,
+    original = replace(
+        prepared,
         photos=(one, replace(two, mask=made, circle=Circle(0.5, 0.4, 0.3)), replace(three, exif=tags)),
         notes=("a note",),
         overlays=(Overlay(("left/1 ü.png",), "a logo", np.array([[True, False]])),),
     )
     assert one.mask is not None
-    assert found.skipped
-    assert prepared_file.can_be_stored(given, capture)
-    prepared_file.store(given, capture, out)
-    key = given.key
+    assert prepared.skipped
+    assert prepared_file.can_be_stored(original, capture)
+    prepared_file.store(original, capture, out)
+    key = original.key
     shutil.rmtree(work)
     there, moved = tmp_path / "there", tmp_path / "moved"
     capture.rename(there)
@@ -66,9 +66,9 @@ def test_photos_are_read_back_where_the_capture_lies_now(tmp_path: Path) -> None
     assert back.photos[1].mask == moved / "overlays" / "1.png"
     assert back.overlays[0].region.tolist() == [[True, False]]
     assert [replace(photo, path=Path(), mask=None, mask_sha256=None) for photo in back.photos] == [
-        replace(photo, path=Path(), mask=None) for photo in given.photos
+        replace(photo, path=Path(), mask=None) for photo in original.photos
     ]
-    assert (back.skipped, back.notes, back.warnings) == (given.skipped, given.notes, given.warnings)
+    assert (back.skipped, back.notes, back.warnings) == (original.skipped, original.notes, original.warnings)
     shutil.rmtree(there)
     shutil.rmtree(moved)
     assert back.key == key, "without any file"
@@ -79,6 +79,6 @@ def test_photos_of_a_zip_are_not_stored(tmp_path: Path) -> None:
     with zipfile.ZipFile(capture / "images" / "more.zip", "w") as archive:
         archive.write(capture / "images" / "left" / "1 ü.png", "inside.png")
     (capture / "images" / "left" / "1 ü.png").unlink()
-    found = prepare(capture / "images", None, tmp_path / "work")
-    assert len(found.photos) == 3
-    assert not prepared_file.can_be_stored(found, capture)
+    prepared = prepare(capture / "images", None, tmp_path / "work")
+    assert len(prepared.photos) == 3
+    assert not prepared_file.can_be_stored(prepared, capture)

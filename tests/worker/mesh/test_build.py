@@ -15,7 +15,7 @@ import torch
 
 from splatmill.schema import Progress
 from splatmill_worker.mesh import build as building
-from splatmill_worker.mesh.build import NoSurface, Wanted, build, chosen
+from splatmill_worker.mesh.build import MeshSettings, NoSurface, build, chosen
 from splatmill_worker.mesh.depths import View, confirmed
 from splatmill_worker.mesh.poisson import TooFine
 from splatmill_worker.scene import Camera
@@ -48,14 +48,14 @@ def cameras(count: int = 12, shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 @pytest.fixture(scope="module")
 def views() -> list[View]:
-    found: list[View] = []
-    build(ball(), cameras(), Wanted(20_000), views=found)
-    return found
+    renderings: list[View] = []
+    build(ball(), cameras(), MeshSettings(20_000), views=renderings)
+    return renderings
 
 
 def test_a_ball_becomes_a_round_mesh_with_its_colours(views: list[View]) -> None:
     stages: list[Progress] = []
-    built = build(ball(), cameras(), Wanted(20_000), told=stages.append, views=views)
+    built = build(ball(), cameras(), MeshSettings(20_000), told=stages.append, views=views)
     radii = np.linalg.norm(built.mesh.vertices, axis=1)
     assert np.abs(radii - 1.0).max() < 2 * built.voxel
     assert abs(np.median(radii) - 1.0) < 0.5 * built.voxel
@@ -72,7 +72,7 @@ def test_a_ball_becomes_a_round_mesh_with_its_colours(views: list[View]) -> None
 
 def test_the_box_and_the_number_of_triangles_are_kept(views: list[View]) -> None:
     box = ((-2.0, -2.0, 0.0), (2.0, 2.0, 2.0))
-    upper = build(ball(), cameras(), Wanted(1500, box=box), views=views)
+    upper = build(ball(), cameras(), MeshSettings(1500, box=box), views=views)
     assert 1000 < len(upper.mesh.faces) <= 1500
     assert upper.mesh.vertices[:, 2].min() > -1e-3
     assert upper.mesh.vertices[:, 2].max() > 0.8
@@ -80,7 +80,7 @@ def test_the_box_and_the_number_of_triangles_are_kept(views: list[View]) -> None
 
 def test_far_from_the_origin_the_mesh_is_as_good() -> None:
     shift = (1000.0, -2000.0, 500.0)
-    built = build(ball(shift), cameras(shift=shift), Wanted(20_000))
+    built = build(ball(shift), cameras(shift=shift), MeshSettings(20_000))
     radii = np.linalg.norm(built.mesh.vertices.astype(np.float64) - shift, axis=1)
     assert np.abs(radii - 1.0).max() < 2.5 * built.voxel
 
@@ -99,15 +99,15 @@ def test_a_depth_that_no_other_view_confirms_is_left_out(views: list[View]) -> N
 def test_without_a_surface_it_is_refused(views: list[View]) -> None:
     faint = replace(ball(), logit_opacities=torch.full((3000,), -4.0))
     with pytest.raises(NoSurface):
-        build(faint, cameras(), Wanted(1000))
+        build(faint, cameras(), MeshSettings(1000))
     with pytest.raises(NoSurface):
-        build(ball(), cameras(), Wanted(1000, box=((5.0, 5.0, 5.0), (6.0, 6.0, 6.0))), views=views)
+        build(ball(), cameras(), MeshSettings(1000, box=((5.0, 5.0, 5.0), (6.0, 6.0, 6.0))), views=views)
 
 
 def test_voxels_that_are_too_fine_are_refused_or_become_larger(views: list[View]) -> None:
     with pytest.raises(TooFine, match=r"0\.00\d+ is the least"):
-        build(ball(), cameras(), Wanted(1000, voxel=1e-5), views=views)
-    coarse = build(ball(), cameras(), Wanted(20_000, voxel=0.1), views=views)
+        build(ball(), cameras(), MeshSettings(1000, voxel=1e-5), views=views)
+    coarse = build(ball(), cameras(), MeshSettings(20_000, voxel=0.1), views=views)
     assert 0.05 < coarse.voxel <= 0.1
     assert coarse.extracted < 10_000
 
@@ -128,5 +128,5 @@ def test_a_training_and_a_renderer_load_nothing_of_it() -> None:
         "splatmill_worker.render_service.encoding; "
         "print(sum('splatmill_worker.mesh' in name for name in sys.modules))"
     )
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert found.stdout.strip() == "0"
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert process.stdout.strip() == "0"

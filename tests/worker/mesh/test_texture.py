@@ -34,7 +34,7 @@ def wall() -> Mesh:
 
 def views() -> list[View]:
     """Two cameras before the wall, on which they see stripes along y: red and green in turn from the left."""
-    seen = []
+    photos = []
     for side in (-0.3, 0.3):
         camera = look_at(np.array([side, 0.1, 4.0]), np.zeros(3), 256, 256, 400.0)
         columns, rows = np.meshgrid(np.arange(256) + 0.5, np.arange(256) + 0.5)
@@ -43,8 +43,10 @@ def views() -> list[View]:
         x = camera.center[0] + depth * rays[:, 0]
         red = (np.floor((x + 1) / 2 * STRIPES) % 2 == 0)[:, None]
         color = np.where(red, [[200, 40, 30]], [[30, 160, 60]]).reshape(256, 256, 3).astype(np.uint8)
-        seen.append(View(camera, torch.from_numpy(color), torch.from_numpy(depth.reshape(256, 256)).float()))
-    return seen
+        photos.append(
+            View(camera, torch.from_numpy(color), torch.from_numpy(depth.reshape(256, 256)).float())
+        )
+    return photos
 
 
 @pytest.fixture(scope="module")

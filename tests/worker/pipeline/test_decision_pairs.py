@@ -66,10 +66,10 @@ def scene(lens: bool, points: bool) -> Scene:
     if not points:
         return Scene(tuple(views), np.zeros((0, 3)), np.zeros((0, 3), np.uint8), "colmap")
     where = np.concatenate(places)
-    seen = [
+    observers = [
         [i for i, view in enumerate(views) if view.camera.project(place[None]).inside[0]] for place in where
     ]
-    tracks = PointViews(np.cumsum([0, *map(len, seen)]), np.concatenate(seen).astype(np.int32))
+    tracks = PointViews(np.cumsum([0, *map(len, observers)]), np.concatenate(observers).astype(np.int32))
     errors = np.full(len(where), 0.5)
     return Scene(
         tuple(views), where, np.concatenate(colors), "colmap", point_errors=errors, point_views=tracks
@@ -97,8 +97,8 @@ def capture(folder: Path, kinds: tuple[str, ...]) -> Path:
             mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
             mask[:, : 1 + index // 4] = 0
             Image.fromarray(mask).save(folder / "masks" / f"{index:02d}.png")
-    given = scene("distorted" in kinds, not transparent)
-    model_of(list(given.views), given.points, given).write_binary(str(folder / "poses"))
+    world = scene("distorted" in kinds, not transparent)
+    model_of(list(world.views), world.points, world).write_binary(str(folder / "poses"))
     if "model" in kinds:
         asked = TrainOptions(steps=60, seed=1, lpips=Switch.off)
         outcome = pipeline.run(folder, folder / "first", asked, lambda _: None, lambda: False)
@@ -204,7 +204,7 @@ def test_photos_in_files_train_the_same_model(
         "holdout": "8",
         "backend": "cpu",
     }
-    found = []
+    runs = []
     step = TrainingRun._step
     for place, fits in (("memory", True), ("files", False)):
         losses: list[float] = []
@@ -223,9 +223,9 @@ def test_photos_in_files_train_the_same_model(
         assert report["facts"]["photos_on_disk"] is not fits
         assert report["facts"]["photo_bytes"] == 4 * COUNT * WIDTH * HEIGHT
         scores = [(point["step"], point["psnr"], point["train_psnr"]) for point in report["curve"]]
-        found.append(((outcome.out / "model.ply").read_bytes(), losses, scores))
+        runs.append(((outcome.out / "model.ply").read_bytes(), losses, scores))
         assert len(losses) == decisions.STEPS
-    assert found[0] == found[1]
+    assert runs[0] == runs[1]
 
 
 @pytest.mark.slow

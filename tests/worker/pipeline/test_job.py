@@ -104,10 +104,10 @@ def test_corrected_cameras_are_exported_and_held_out_ones_are_not_touched(tmp_pa
     assert 0.0 < report["result"]["cameras_moved_pixels"] < 5.0
     assert "Held-out cameras are not corrected" in report["plan"]["reasons"]["pose_refinement"]
     cameras = ModelCameras.model_validate_json((out / "cameras.json").read_text()).cameras
-    given = {view.name: view.camera.center for view in still_life.scene().views}
+    centers = {view.name: view.camera.center for view in still_life.scene().views}
     moves = {
         camera.name: float(
-            np.linalg.norm(np.array(camera.camera.camera_to_world)[:3, 3] - given[camera.name])
+            np.linalg.norm(np.array(camera.camera.camera_to_world)[:3, 3] - centers[camera.name])
         )
         for camera in cameras
     }
@@ -132,10 +132,10 @@ def test_the_model_shows_the_photos_at_the_reported_error_in_the_captures_own_wo
         assert row.photo is not None
         with Image.open(out / row.photo) as opened:
             photo = torch.from_numpy(np.asarray(opened).copy())
-        seen = compare(row.name, render(scene, camera).color, photo)
+        scores = compare(row.name, render(scene, camera).color, photo)
         assert row.psnr is not None
-        assert seen.psnr == pytest.approx(row.psnr, abs=0.05)
-        assert seen.ssim == pytest.approx(row.ssim, abs=0.002)
+        assert scores.psnr == pytest.approx(row.psnr, abs=0.05)
+        assert scores.ssim == pytest.approx(row.ssim, abs=0.002)
 
 
 def test_a_cancelled_run_goes_on_from_its_checkpoint(tmp_path: Path) -> None:

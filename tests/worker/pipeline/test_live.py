@@ -66,14 +66,16 @@ def test_snapshots_are_the_scene_in_the_coordinates_of_the_model(tmp_path: Path)
     assert 0 < event.step <= 60
     path = tmp_path / "snapshot.ply"
     path.write_bytes(ply)
-    seen = compressed_ply.read(path).gaussians
+    snapshot = compressed_ply.read(path).gaussians
     model = pipeline_model(outcome)
-    assert seen.degree == 0
-    assert abs(seen.count - model.count) < 0.2 * model.count
+    assert snapshot.degree == 0
+    assert abs(snapshot.count - model.count) < 0.2 * model.count
     # Steps after the snapshot move Gaussians by little of the scene's size, and the still life has no symmetry.
     spread = model.means.std(dim=0)
-    assert torch.allclose(seen.means.mean(dim=0), model.means.mean(dim=0), atol=0.05 * float(spread.max()))
-    assert torch.allclose(seen.means.std(dim=0), spread, rtol=0.1)
+    assert torch.allclose(
+        snapshot.means.mean(dim=0), model.means.mean(dim=0), atol=0.05 * float(spread.max())
+    )
+    assert torch.allclose(snapshot.means.std(dim=0), spread, rtol=0.1)
     seconds = json.loads((outcome.out / "report.json").read_text())["seconds"]
     assert seconds["live"] > 0
 

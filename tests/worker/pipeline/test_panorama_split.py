@@ -106,9 +106,9 @@ def test_cameras_zip_gives_the_panoramas_back(scene: Scene, tmp_path: Path, form
         archive.extractall(
             tmp_path / "poses", [name for name in archive.namelist() if name.startswith((form, "points"))]
         )
-    found = posed.find(tmp_path)
-    assert found is not None
-    read = faces.cut(found.load())
+    source = posed.find(tmp_path)
+    assert source is not None
+    read = faces.cut(source.load())
     assert [view.name for view in read.views] == [view.name for view in scene.views]
     for mine, theirs in zip(read.views, scene.views, strict=True):
         np.testing.assert_allclose(mine.camera.viewmat, theirs.camera.viewmat, atol=1e-9)

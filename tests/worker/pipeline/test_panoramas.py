@@ -160,8 +160,8 @@ def test_photos_of_all_directions_train_as_well_as_pinhole_photos_of_the_same(
         (capture / "points.ply").write_text("\n".join([*header, *points, ""]))
     trained_on = [each["file_path"] for each in frames if each["file_path"] not in test_names]
     pinholes = trained(of_pinholes, frames, train_filenames=trained_on, test_filenames=test_names)
-    given = [frame_of(view.name, view.camera.viewmat, **intrinsics(view)) for view in views]
-    spheres = trained(of_photos, given)
+    sphere_frames = [frame_of(view.name, view.camera.viewmat, **intrinsics(view)) for view in views]
+    spheres = trained(of_photos, sphere_frames)
     ours, theirs = psnr(spheres, held_out), psnr(pinholes, held_out)
     assert ours > theirs - 1.0
     report = json.loads((spheres / "report.json").read_text())

@@ -70,9 +70,9 @@ def test_a_training_is_filmed_from_an_orbit(tmp_path: Path) -> None:
     assert np.abs(frames[len(frames) // 3].astype(float) - frames[-1]).mean() > 15.0
 
 
-@pytest.mark.parametrize(("given", "video"), [(True, ProgressVideo.view), (False, ProgressVideo.off)])
-def test_true_and_false_ask_for_a_view_and_for_nothing(given: bool, video: ProgressVideo) -> None:
-    assert TrainOptions.model_validate({"progress_video": given}).progress_video is video
+@pytest.mark.parametrize(("switch", "video"), [(True, ProgressVideo.view), (False, ProgressVideo.off)])
+def test_true_and_false_ask_for_a_view_and_for_nothing(switch: bool, video: ProgressVideo) -> None:
+    assert TrainOptions.model_validate({"progress_video": switch}).progress_video is video
 
 
 def test_a_film_goes_on_after_a_cancelled_attempt(tmp_path: Path) -> None:

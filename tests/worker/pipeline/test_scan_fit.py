@@ -111,18 +111,18 @@ def test_a_file_without_colours_gets_those_of_the_photos_where_its_points_lie(sc
 def test_the_scene_keeps_its_tracks_and_the_scan_gets_some(scene: Scene, tmp_path: Path) -> None:
     points, colors = scanned()
     write_las(tmp_path / "scan.laz", TURN.points(points), colors)
-    found = with_given_points(scene, tmp_path / "scan.laz", TrainOptions(), quiet, lambda: False)
-    own, used = len(scene.points), found.facts["given_points_used"]
-    assert len(found.points) == own + used
-    assert found.facts["sparse_points"] == own
-    assert found.point_views is not None
-    assert found.point_views.views[: 2 * own].tolist() == [0, 1] * own
-    added = np.diff(found.point_views.offsets)[own:]
+    result = with_given_points(scene, tmp_path / "scan.laz", TrainOptions(), quiet, lambda: False)
+    own, used = len(scene.points), result.facts["given_points_used"]
+    assert len(result.points) == own + used
+    assert result.facts["sparse_points"] == own
+    assert result.point_views is not None
+    assert result.point_views.views[: 2 * own].tolist() == [0, 1] * own
+    added = np.diff(result.point_views.offsets)[own:]
     assert 2 < np.median(added) < len(scene.views)
-    assert found.point_errors is not None
-    assert np.isfinite(found.point_errors).sum() == own
-    assert found.frame is not None
-    assert found.frame.unit == "arbitrary"  # nothing says that the numbers of a .laz are metres
+    assert result.point_errors is not None
+    assert np.isfinite(result.point_errors).sum() == own
+    assert result.frame is not None
+    assert result.frame.unit == "arbitrary"  # nothing says that the numbers of a .laz are metres
 
 
 def test_a_format_in_metres_gives_the_scene_its_unit(
@@ -131,21 +131,21 @@ def test_a_format_in_metres_gives_the_scene_its_unit(
     points, colors = scanned()
     write_ply(tmp_path / "scan.ply", TURN.points(points), colors)
     monkeypatch.setattr("splatmill_worker.readers.scan.IN_METRES", (".ply",))
-    found = with_given_points(scene, tmp_path / "scan.ply", TrainOptions(), quiet, lambda: False)
-    assert found.frame is not None
-    assert found.frame.unit == "metre"
-    assert found.frame.reasons["unit"] == "Metres, because those of scan.ply are."
-    assert "The unit is arbitrary." not in found.notes
-    assert np.cbrt(np.linalg.det(np.array(found.frame.from_sfm)[:3, :3])) == pytest.approx(250, rel=0.01)
-    grown = np.linalg.norm(found.centers[3] - found.centers[0]) / np.linalg.norm(
+    result = with_given_points(scene, tmp_path / "scan.ply", TrainOptions(), quiet, lambda: False)
+    assert result.frame is not None
+    assert result.frame.unit == "metre"
+    assert result.frame.reasons["unit"] == "Metres, because those of scan.ply are."
+    assert "The unit is arbitrary." not in result.notes
+    assert np.cbrt(np.linalg.det(np.array(result.frame.from_sfm)[:3, :3])) == pytest.approx(250, rel=0.01)
+    grown = np.linalg.norm(result.centers[3] - result.centers[0]) / np.linalg.norm(
         scene.centers[3] - scene.centers[0]
     )
     assert grown == pytest.approx(250, rel=0.01)
-    alignment = found.facts["given_points_alignment"]
+    alignment = result.facts["given_points_alignment"]
     assert alignment["scale"] == 1.0
     matrix = Similarity.of(np.array(alignment["matrix"]))
     used = matrix.points(TURN.points(points))
-    far, _ = cKDTree(used).query(found.points)
+    far, _ = cKDTree(used).query(result.points)
     assert np.median(far) < 250 * 0.1
 
 
@@ -183,12 +183,12 @@ def test_a_scan_and_photos_alone(tmp_path: Path) -> None:
     (capture / "poses").mkdir()
     points, colors = scanned()
     write_las(capture / "poses" / "scan.laz", TURN.points(points), colors)
-    found = posed_scene(
+    result = posed_scene(
         capture, tmp_path / "work", TrainOptions(start="scan.laz"), lambda *_: None, lambda: False
     )
-    alignment = found.facts["given_points_alignment"]
+    alignment = result.facts["given_points_alignment"]
     to_model = TURN.then(Similarity.of(np.array(alignment["matrix"])))
-    for view in found.views:
+    for view in result.views:
         apart = np.linalg.norm(to_model.points(truth[view.name].center) - view.camera.center)
         assert apart < 0.02 * to_model.scale * np.linalg.norm(truth[view.name].center)
-    assert found.facts["given_points_used"] > 5000
+    assert result.facts["given_points_used"] > 5000

@@ -48,7 +48,7 @@ class Holder:
         }
 
 
-def seen(engine: Holder, progress: float, seconds: float, step: int) -> Any:
+def run_at(engine: Holder, progress: float, seconds: float, step: int) -> Any:
     """What is asked of a run that holds a scene."""
     return SimpleNamespace(
         engine=engine,
@@ -111,7 +111,7 @@ def test_snapshots_take_a_hundredth_of_the_training(
     for _ in range(1000):  # 100 seconds of training
         now += 0.1
         progress = next(steps) / 1000
-        run = seen(Slow(), progress, now, round(1000 * progress))
+        run = run_at(Slow(), progress, now, round(1000 * progress))
         if lapse.is_due(run):
             lapse.observe(run)
     taken = len(list(tmp_path.glob("*.ply")))
@@ -122,9 +122,9 @@ def test_snapshots_take_a_hundredth_of_the_training(
 def test_the_snapshots_after_a_checkpoint_are_taken_again(tmp_path: Path) -> None:
     lapse = TimeLapse(tmp_path, WORLD, anew=True)
     for step in (10, 20, 30):
-        lapse.observe(seen(Holder(), step / 100, 1.0, step))
+        lapse.observe(run_at(Holder(), step / 100, 1.0, step))
     again = TimeLapse(tmp_path, WORLD, anew=False)
-    again.observe(seen(Holder(5), 0.2, 1.0, 20))
+    again.observe(run_at(Holder(5), 0.2, 1.0, 20))
     (tmp_path / "out").mkdir()
     rows = again.publish(tmp_path / "out")
     assert [(row["step"], row["gaussians"]) for row in rows] == [(10, 10), (20, 5)]

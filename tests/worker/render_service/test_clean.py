@@ -19,7 +19,7 @@ from PIL import Image
 
 from splatmill.schema import CameraSpec, EditModel, ModelCamera, ModelCameras
 from splatmill_worker.errors import Refusal
-from splatmill_worker.render_service.clean import Wanted, clean_file, main, table
+from splatmill_worker.render_service.clean import CleanSettings, clean_file, main, table
 from splatmill_worker.render_service.encoding import camera_of
 from splatmill_worker.splat.formats import ply
 from splatmill_worker.splat.gaussians import Gaussians, concatenate
@@ -74,7 +74,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Spoilt:
 @pytest.mark.slow
 def test_what_the_photos_do_not_support_goes_and_the_rest_stays(made: Spoilt, tmp_path: Path) -> None:
     out = tmp_path / "cleaned.ply"
-    cleaned = clean_file(made.model, out, Wanted(capture=made.capture))
+    cleaned = clean_file(made.model, out, CleanSettings(capture=made.capture))
     whole, left = ply.read(made.model).gaussians, ply.read(out).gaussians
     assert cleaned.before == OWN + PLANTED
     assert cleaned.left == left.count == OWN
@@ -100,39 +100,39 @@ def test_what_the_photos_do_not_support_goes_and_the_rest_stays(made: Spoilt, tm
 def test_a_box_and_a_weight_need_no_photos(made: Spoilt, tmp_path: Path) -> None:
     out = tmp_path / "cleaned.ply"
     box = EditModel.model_validate({"box": {"min": (-1, -1, -9), "max": (1, 1, 9)}})
-    cleaned = clean_file(made.model, out, Wanted(edit=box))
+    cleaned = clean_file(made.model, out, CleanSettings(edit=box))
     means = ply.read(made.model).gaussians.means
     inside = (means[:, :2].abs() <= 1).all(dim=1)
     assert cleaned.left == int(inside.sum())
     assert cleaned.removed == {"outside the box": int((~inside).sum())}
     assert torch.equal(ply.read(out).gaussians.means, means[inside])
-    heavy = clean_file(made.model, out, Wanted(min_weight=20.0))
+    heavy = clean_file(made.model, out, CleanSettings(min_weight=20.0))
     assert 0 < heavy.left < OWN
     assert heavy.removed == {"weight below 20": OWN + PLANTED - heavy.left}
     assert heavy.photos is None
-    assert clean_file(made.model, out, Wanted(min_weight=0.0)).left == OWN + PLANTED
+    assert clean_file(made.model, out, CleanSettings(min_weight=0.0)).left == OWN + PLANTED
 
 
 @pytest.mark.slow
 def test_photos_alone_take_the_cameras_beside_the_model(made: Spoilt, tmp_path: Path) -> None:
     shutil.copytree(made.capture / "images", tmp_path / "photos")
     shutil.copy(made.model, tmp_path / "model.ply")
-    wanted = Wanted(capture=tmp_path / "photos", image_size=64)
+    options = CleanSettings(capture=tmp_path / "photos", image_size=64)
     with pytest.raises(Refusal, match=r"has no cameras .* no cameras.zip beside model.ply"):
-        clean_file(tmp_path / "model.ply", tmp_path / "out.ply", wanted)
+        clean_file(tmp_path / "model.ply", tmp_path / "out.ply", options)
     with zipfile.ZipFile(tmp_path / "cameras.zip", "w") as archive:
         archive.writestr("../outside.txt", "one directory up")
     with pytest.raises(Refusal, match=r"cameras.zip is damaged: .*outside.txt"):
-        clean_file(tmp_path / "model.ply", tmp_path / "out.ply", wanted)
+        clean_file(tmp_path / "model.ply", tmp_path / "out.ply", options)
     (tmp_path / "cameras.zip").write_bytes(b"none")
     with pytest.raises(Refusal, match="is damaged"):
-        clean_file(tmp_path / "model.ply", tmp_path / "out.ply", wanted)
+        clean_file(tmp_path / "model.ply", tmp_path / "out.ply", options)
     folder = tmp_path / "zipped"
     folder.mkdir()
     shutil.copy(made.capture / "transforms.json", folder)
     shutil.make_archive(str(tmp_path / "cameras"), "zip", folder)
     # Without a cameras.json, every eighth photo is held out, as in a training.
-    cleaned = clean_file(tmp_path / "model.ply", tmp_path / "out.ply", wanted)
+    cleaned = clean_file(tmp_path / "model.ply", tmp_path / "out.ply", options)
     assert cleaned.left == OWN
     assert cleaned.held_out is not None
     assert cleaned.held_out[0] == 2
@@ -142,11 +142,11 @@ def test_a_damaged_cameras_json_is_refused(made: Spoilt, tmp_path: Path) -> None
     """Without it, photos that training has left out would decide."""
     shutil.copy(made.model, tmp_path / "model.ply")
     (tmp_path / "cameras.json").write_text('{"cameras": [')
-    for wanted in (Wanted(capture=made.capture), Wanted(min_weight=1.0)):
+    for options in (CleanSettings(capture=made.capture), CleanSettings(min_weight=1.0)):
         with pytest.raises(
             Refusal, match=r"cameras.json is damaged: .+\. It names the photos that were held out"
         ):
-            clean_file(tmp_path / "model.ply", tmp_path / "out.ply", wanted)
+            clean_file(tmp_path / "model.ply", tmp_path / "out.ply", options)
     assert not (tmp_path / "out.ply").exists()
 
 
@@ -157,7 +157,7 @@ def test_a_model_of_another_scene_is_refused(
     other = some_gaussians(OWN, 1, seed=5)
     ply.write(tmp_path / "model.ply", other)
     out = tmp_path / "out.ply"
-    assert main(tmp_path / "model.ply", out, Wanted(capture=made.capture)) == 5
+    assert main(tmp_path / "model.ply", out, CleanSettings(capture=made.capture)) == 5
     assert "dB" in capsys.readouterr().err
     assert not out.exists()
 
@@ -165,8 +165,8 @@ def test_a_model_of_another_scene_is_refused(
 def test_nothing_left_and_no_cameras_are_refused(made: Spoilt, tmp_path: Path) -> None:
     away = EditModel.model_validate({"box": {"min": (50, 50, 50), "max": (51, 51, 51)}})
     with pytest.raises(Refusal, match="Nothing would be left of the 305 Gaussians"):
-        clean_file(made.model, tmp_path / "out.ply", Wanted(edit=away))
+        clean_file(made.model, tmp_path / "out.ply", CleanSettings(edit=away))
     shutil.copy(made.model, tmp_path / "model.ply")
     with pytest.raises(Refusal, match=r"no cameras.json beside model.ply. Give the photos"):
-        clean_file(tmp_path / "model.ply", tmp_path / "out.ply", Wanted(min_weight=1.0))
+        clean_file(tmp_path / "model.ply", tmp_path / "out.ply", CleanSettings(min_weight=1.0))
     assert not (tmp_path / "out.ply").exists()

@@ -27,8 +27,8 @@ HALF = EditModel.model_validate({"box": {"min": [0, -2, -2], "max": [2, 2, 2]}})
 @pytest.fixture
 def storage(tmp_path: Path) -> Storage:
     """The ball, with one held-out photo that is its own rendering; the left half of the photo does not count."""
-    found = Storage(str(tmp_path / "storage"))
-    store_ball(found, tmp_path)
+    store = Storage(str(tmp_path / "storage"))
+    store_ball(store, tmp_path)
     camera = CameraSpec.looking_at((0, -4, 0), (0, 0, 0), width=64, height=48)
     model = ply.read(tmp_path / "model.ply").gaussians
     color = render(model, camera_of(camera), background=(0.0, 0.0, 0.0)).color
@@ -37,15 +37,15 @@ def storage(tmp_path: Path) -> Storage:
     pixels[:, :32, 3] = 0
     picture = tmp_path / "photo.webp"
     Image.fromarray(pixels).save(picture, "WEBP", lossless=True, exact=True)
-    found.put(layout.model_file(BALL, "held_out/000.webp"), picture)
+    store.put(layout.model_file(BALL, "held_out/000.webp"), picture)
     row = {
         "name": "a.jpg",
         "split": "test",
         "camera": camera.model_dump(mode="json"),
         "photo": "held_out/000.webp",
     }
-    found.put(layout.model_file(BALL, "cameras.json"), json.dumps({"cameras": [row]}).encode())
-    return found
+    store.put(layout.model_file(BALL, "cameras.json"), json.dumps({"cameras": [row]}).encode())
+    return store
 
 
 def test_box_opacity_and_size_choose_what_stays(storage: Storage, tmp_path: Path) -> None:

@@ -62,8 +62,8 @@ def towards(x: float, distance: float) -> Camera:
     return Camera(160, 120, 150.0, 150.0, 80.0, 60.0, viewmat)
 
 
-def psnr(found: torch.Tensor, wanted: torch.Tensor) -> float:
-    return float(-10 * torch.log10((found - wanted).square().mean()))
+def psnr(image: torch.Tensor, expected: torch.Tensor) -> float:
+    return float(-10 * torch.log10((image - expected).square().mean()))
 
 
 @pytest.mark.parametrize(("x", "distance"), [(0, 3), (12, 3), (0, 12), (-15, 12)])
@@ -75,8 +75,8 @@ def test_a_near_view_is_that_of_all_gaussians_and_takes_those_in_view(
         assert model is not None
         drawn = model.seen_by(camera)
     assert drawn.count < COUNT / 2
-    wanted = render(whole, camera, antialias=True)
-    torch.testing.assert_close(render(drawn, camera, antialias=True).color, wanted.color, rtol=0, atol=1e-5)
+    expected = render(whole, camera, antialias=True)
+    torch.testing.assert_close(render(drawn, camera, antialias=True).color, expected.color, rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("distance", [200, 400])

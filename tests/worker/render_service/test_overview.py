@@ -55,8 +55,8 @@ def test_the_dense_middle_fills_the_picture(others: Points, opacity: float) -> N
     assert 2.0 < path.radius < 4.0
     for camera in orbit.cameras_along(path, SIZE, orbit.DEFAULT_FOV):
         assert camera.viewmat[1, :3] @ [0.0, 1.0, 0.0] > 0.9, "y points down in the picture"
-        seen = camera.project(points[:1000])
-        rows, columns = np.asarray(seen.rows), np.asarray(seen.columns)
+        projection = camera.project(points[:1000])
+        rows, columns = np.asarray(projection.rows), np.asarray(projection.columns)
         inside = (rows > 0) & (rows < 48) & (columns > 0) & (columns < 64)
         assert inside.mean() > 0.97
         assert np.ptp(rows) > 24

@@ -152,9 +152,11 @@ def test_an_owner_with_many_clients_leaves_places_to_others() -> None:
     async def crowd() -> list[int]:
         queue = RenderQueue(max_waiting=9, max_of_client=3, max_of_owner=5, reserved=2)
         async with AsyncExitStack() as stack:
-            found = [await admitted(queue, stack, owner, 20) for owner in ("ann", "bob", "eve", "dan", "fay")]
+            counts = [
+                await admitted(queue, stack, owner, 20) for owner in ("ann", "bob", "eve", "dan", "fay")
+            ]
         assert queue.admitted_count == 0
-        return found
+        return counts
 
     # The last two places are for owners with no other request.
     assert asyncio.run(crowd()) == [5, 3, 1, 1, 0]

@@ -83,8 +83,8 @@ def test_an_attempt_stops_at_the_reserve_and_a_restart_goes_on(
     checkpoint = tmp_path / "data" / "work" / JOB / "run" / "checkpoints" / "state.json"
 
     def attempt(generation: int, full_at: int) -> None:
-        given = [redis_server.url, f"{JOB}-{generation}", str(checkpoint), str(full_at)]
-        subprocess.run([sys.executable, "-c", ATTEMPT, *given], env=environment, check=True, timeout=60)
+        arguments = [redis_server.url, f"{JOB}-{generation}", str(checkpoint), str(full_at)]
+        subprocess.run([sys.executable, "-c", ATTEMPT, *arguments], env=environment, check=True, timeout=60)
 
     write_row(connection, JOB)
     attempt(1, full_at=5)
@@ -114,9 +114,9 @@ def test_a_worker_takes_no_jobs_while_its_disk_is_full_and_says_so(
     with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True) as worker:
         wait_for(
             lambda: [
-                found
-                for found in Worker.all(connection=connection, serializer=entries.SERIALIZER)
-                if found.get_state() == "suspended"
+                each
+                for each in Worker.all(connection=connection, serializer=entries.SERIALIZER)
+                if each.get_state() == "suspended"
             ]
         )
         assert queue.status(connection, JOB, 1).state == "waiting"

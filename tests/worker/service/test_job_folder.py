@@ -84,9 +84,9 @@ def test_files_come_from_a_bucket_several_at_a_time_and_their_number_is_told(
         assert staging.result(20) == PHOTOS
     assert staged(folder) == {f"images/{number:02}.jpg": b"%d" % number for number in range(PHOTOS)}
     assert told == [(done, PHOTOS) for done in range(1, PHOTOS + 1)]
-    s3.seen.clear()
+    s3.requests.clear()
     folder.stage_capture()
-    assert [seen.path for seen in s3.seen if "/files/images/" in seen.path] == [], (
+    assert [request.path for request in s3.requests if "/files/images/" in request.path] == [], (
         "files that are present are not fetched"
     )
 

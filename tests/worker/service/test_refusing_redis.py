@@ -32,8 +32,8 @@ JOB = "job00001"
 
 def failing_disk(connection: Any) -> None:
     """Let the next dump fail, after which Redis refuses writes."""
-    (found,) = (value for name, value in connection.config_get("dir").items() if name in ("dir", b"dir"))
-    (Path(os.fsdecode(found)) / "dump.rdb").mkdir(exist_ok=True)  # a folder, which the dump cannot replace
+    (folder,) = (value for name, value in connection.config_get("dir").items() if name in ("dir", b"dir"))
+    (Path(os.fsdecode(folder)) / "dump.rdb").mkdir(exist_ok=True)  # a folder, which the dump cannot replace
     connection.config_set("save", "3600 1")
     connection.set("something", "to dump")
     connection.bgsave()
@@ -142,7 +142,7 @@ def test_a_job_goes_on_while_redis_refuses_writes(
         wait_for(trained.is_file, 60)  # the training ends meanwhile
         assert not read_job(connection, JOB).state.final
         allow(connection)
-        job = wait_for(lambda: (found := read_job(connection, JOB)).state.final and found, 60)
+        job = wait_for(lambda: (row := read_job(connection, JOB)).state.final and row, 60)
         assert (job.state, job.attempt) == ("succeeded", 1)
         assert len(attempts(tmp_path)) == 1
         states = [stored.event for stored in events.read_states(connection, JOB)]
@@ -169,7 +169,7 @@ def test_an_attempt_ends_by_name_after_the_limit_and_the_job_goes_on(
         refuse(connection)
         wait_for(lambda: not Path(f"/proc/{attempt['pid']}").exists(), 60)
         allow(connection)
-        job = wait_for(lambda: (found := read_job(connection, JOB)).state.final and found, 60)
+        job = wait_for(lambda: (row := read_job(connection, JOB)).state.final and row, 60)
         assert job.state == "succeeded"
         assert any("Redis took no events" in message for message in messages(connection, JOB))
 
@@ -185,5 +185,5 @@ def test_a_worker_begins_when_redis_takes_writes(redis_server: RedisServer, tmp_
         with running_worker(environment):
             time.sleep(3)  # a worker that gives up at once would be gone
             allow(connection)
-            job = wait_for(lambda: (found := read_job(connection, JOB)).state.final and found, 60)
+            job = wait_for(lambda: (row := read_job(connection, JOB)).state.final and row, 60)
             assert job.state == "succeeded"

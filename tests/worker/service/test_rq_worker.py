@@ -94,8 +94,8 @@ def test_the_function_and_callbacks_that_an_entry_names_are_never_imported(
     with worker(redis_server, storage, tmp_path):
         jobs = {job_id: wait_for(partial(ended, redis_server, job_id)) for job_id in functions}
         wait_for(lambda: counted("reported") == len(functions))
-        [found] = workers.listening(redis_server.connection)
-        assert found.spare is not None
+        [listener] = workers.listening(redis_server.connection)
+        assert listener.spare is not None
     assert float(redis_server.connection.hget(keys.TOTALS, totals.ATTEMPT_CPU.name) or 0) > 0
     assert {job_id: job.state for job_id, job in jobs.items()} == dict.fromkeys(functions, "succeeded")
     assert {job.attempt for job in jobs.values()} == {1}

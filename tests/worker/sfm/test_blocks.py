@@ -50,9 +50,9 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Prepared:
     mask = np.full((180, 240), 255, np.uint8)
     mask[:, :60] = 0
     Image.fromarray(mask).save(root / "masks" / f"{masked.stem}.png")
-    found = prepare(root / "images", root / "masks", root)
-    assert (len(found.photos), sum(photo.mask is not None for photo in found.photos)) == (COUNT, 1)
-    return found
+    result = prepare(root / "images", root / "masks", root)
+    assert (len(result.photos), sum(photo.mask is not None for photo in result.photos)) == (COUNT, 1)
+    return result
 
 
 @pytest.fixture(scope="module")
@@ -87,8 +87,8 @@ def in_blocks(prepared: Prepared, root: Path, count: int, lost: int | None = Non
     for number in range(1, count + 1):
         if number != lost:
             features.append(root / f"features-{number}")
-            found = blocks.find_block(prepared, features[-1], OPTIONS, Block(number, count), silent, never)
-            assert found in (COUNT // count, COUNT // count + 1)
+            size = blocks.find_block(prepared, features[-1], OPTIONS, Block(number, count), silent, never)
+            assert size in (COUNT // count, COUNT // count + 1)
     scored = root / "pairs"
     chosen = blocks.score_pairs(prepared, scored, OPTIONS, features, silent, never)
     assert len(photos_in(database_in(scored), with_features=True)) == (0 if lost is None else COUNT // count)
@@ -128,9 +128,9 @@ def test_the_database_is_that_of_one_process(
 def test_what_is_there_is_not_found_again(prepared: Prepared, tmp_path: Path) -> None:
     parts, work = in_blocks(prepared, tmp_path, 2)
     before = {table: rows(database_in(work), table) for table in ("descriptors", "matches")}
-    seen = []
-    blocks.merge(parts, work, lambda done, total: seen.append((done, total)), never)  # once more
-    assert seen == [(number, 5) for number in range(1, 6)]
+    reports = []
+    blocks.merge(parts, work, lambda done, total: reports.append((done, total)), never)  # once more
+    assert reports == [(number, 5) for number in range(1, 6)]
     with pytest.raises(Cancelled):
         blocks.merge(parts, work, lambda done, total: None, lambda: True)
     assert {table: rows(database_in(work), table) for table in before} == before
@@ -144,17 +144,17 @@ def test_what_is_there_is_not_found_again(prepared: Prepared, tmp_path: Path) ->
 
 
 def test_progress_is_that_of_the_block_and_a_cancelled_one_ends(prepared: Prepared, tmp_path: Path) -> None:
-    seen = []
+    reports = []
     blocks.find_block(
         prepared,
         tmp_path,
         OPTIONS,
         Block(2, 4),
-        lambda stage, done, total, note: seen.append((stage, done, total, note)),
+        lambda stage, done, total, note: reports.append((stage, done, total, note)),
         never,
     )
     names = [photo.name for photo in prepared.photos[4:8]]
-    assert seen == [("features", number, 4, name) for number, name in enumerate(names, 1)]
+    assert reports == [("features", number, 4, name) for number, name in enumerate(names, 1)]
     with pytest.raises(Cancelled):
         blocks.find_block(prepared, tmp_path / "other", OPTIONS, Block(1, 1), silent, lambda: True)
 

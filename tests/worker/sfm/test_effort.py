@@ -196,15 +196,15 @@ def test_no_higher_effort_is_tried_where_there_is_no_time_for_it(
     )
 
 
-@pytest.mark.parametrize(("found", "tried"), [(31, ["lean", "high"]), (29, ["lean"])])
+@pytest.mark.parametrize(("feature_count", "tried"), [(31, ["lean", "high"]), (29, ["lean"])])
 def test_the_next_effort_but_one_is_tried_where_the_next_would_find_the_same(
-    found: int, tried: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    feature_count: int, tried: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls: list[str] = []
 
     def solve_at(_run: object, tried_effort: options.Effort, _best: object) -> Any:
         calls.append(tried_effort.name)
-        few = [SimpleNamespace(scales=np.ones(found))] * 50
+        few = [SimpleNamespace(scales=np.ones(feature_count))] * 50
         return SimpleNamespace(mapped=None, effort=tried_effort, verified=[(0, 1)], features=few)
 
     monkeypatch.setattr(solve, "solve_at", solve_at)
@@ -221,7 +221,7 @@ def test_the_next_effort_but_one_is_tried_where_the_next_would_find_the_same(
 
 
 @pytest.mark.parametrize(
-    ("found", "count", "side", "matcher", "skipped"),
+    ("feature_count", "count", "side", "matcher", "skipped"),
     [
         (options.LEAN.features - 1, 10, 640, "auto", {"standard", "high"}),
         (options.LEAN.features - 1, pairs.EXHAUSTIVE_UP_TO + 1, 640, "auto", {"standard"}),  # more pairs
@@ -232,7 +232,7 @@ def test_the_next_effort_but_one_is_tried_where_the_next_would_find_the_same(
     ],
 )
 def test_an_effort_that_would_find_the_same_is_left_out(
-    found: int, count: int, side: int, matcher: Any, skipped: set[str]
+    feature_count: int, count: int, side: int, matcher: Any, skipped: set[str]
 ) -> None:
     run: Any = SimpleNamespace(
         count=count,
@@ -240,7 +240,7 @@ def test_an_effort_that_would_find_the_same_is_left_out(
         options=sfm.SfmOptions(matcher=matcher),
     )
     best: Any = SimpleNamespace(
-        effort=options.LEAN, features=[SimpleNamespace(scales=np.ones(each)) for each in (3, found)]
+        effort=options.LEAN, features=[SimpleNamespace(scales=np.ones(each)) for each in (3, feature_count)]
     )
     higher = options.STANDARD, options.HIGH
     assert {each.name for each in higher if solve._finds_the_same(run, best, each)} == skipped

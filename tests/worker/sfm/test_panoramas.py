@@ -51,10 +51,10 @@ def errors(scene: Scene, truth: dict[str, Float]) -> tuple[float, float]:
     views = [view for view in joined(scene).views if view.name in truth]
     poses = [truth[view.name] for view in views]
     centers = np.array([view.camera.center for view in views])
-    wanted = np.array([-pose[:3, :3].T @ pose[:3, 3] for pose in poses])
-    similarity = pycolmap.estimate_sim3d(centers, wanted)
+    expected = np.array([-pose[:3, :3].T @ pose[:3, 3] for pose in poses])
+    similarity = pycolmap.estimate_sim3d(centers, expected)
     assert similarity is not None
-    off = np.linalg.norm(np.array([similarity * center for center in centers]) - wanted, axis=1)
+    off = np.linalg.norm(np.array([similarity * center for center in centers]) - expected, axis=1)
     turn = similarity.rotation.matrix()
     angles = [
         np.degrees(
@@ -64,7 +64,7 @@ def errors(scene: Scene, truth: dict[str, Float]) -> tuple[float, float]:
         )
         for view, pose in zip(views, poses, strict=True)
     ]
-    radius = np.linalg.norm(wanted - wanted.mean(axis=0), axis=1).max()
+    radius = np.linalg.norm(expected - expected.mean(axis=0), axis=1).max()
     return float(max(angles)), float(off.max() / radius)
 
 

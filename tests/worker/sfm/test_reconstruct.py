@@ -146,19 +146,19 @@ def test_a_stored_model_that_is_damaged_is_recovered_anew(
 def test_a_cancelled_run_continues_from_what_it_stored(
     still_life: tuple[Path, dict[str, Camera]], tmp_path: Path
 ) -> None:
-    seen: list[str] = []
+    stages: list[str] = []
 
     def watch(stage: str, done: int, total: int, note: str) -> None:
-        seen.append(stage)
+        stages.append(stage)
 
     # A raised effort would look for features again; stereo comes after all that is continued.
     lean = sfm.SfmOptions(effort="lean", stereo=False)
     with pytest.raises(Cancelled):
-        sfm.reconstruct(still_life[0], None, tmp_path, lean, watch, lambda: "matching" in seen)
-    assert "mapping" not in seen
-    before = len(seen)
+        sfm.reconstruct(still_life[0], None, tmp_path, lean, watch, lambda: "matching" in stages)
+    assert "mapping" not in stages
+    before = len(stages)
     scene = sfm.reconstruct(still_life[0], None, tmp_path, lean, watch, lambda: False)
-    assert "features" not in seen[before:]
+    assert "features" not in stages[before:]
     assert len(scene.views) >= 14
 
 

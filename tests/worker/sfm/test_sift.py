@@ -33,23 +33,23 @@ def _blobs() -> tuple[Grey, npt.NDArray[np.float64]]:
 
 def test_blobs_are_found_at_their_places_and_sizes() -> None:
     grey, blobs = _blobs()
-    found = sift.find(grey, None, 1000)
-    distances = np.linalg.norm(found.points - blobs[:, None, :2], axis=2)
+    features = sift.find(grey, None, 1000)
+    distances = np.linalg.norm(features.points - blobs[:, None, :2], axis=2)
     nearest = distances.argmin(axis=1)
-    offsets = found.points[nearest] - blobs[:, :2]
+    offsets = features.points[nearest] - blobs[:, :2]
     assert np.abs(offsets).max() < 0.1
     # The centre of the first pixel is at 0.5: no picture of half the pixels is shifted against another.
     np.testing.assert_allclose(offsets.mean(axis=0), 0.0, atol=0.02)
     # The difference of Gaussians of sigma and 2^(1/3) sigma is largest where sigma is 2^(-1/6) times that of the blob.
-    np.testing.assert_allclose(found.scales[nearest] / blobs[:, 2], 2 ** (-1 / 6), atol=0.03)
+    np.testing.assert_allclose(features.scales[nearest] / blobs[:, 2], 2 ** (-1 / 6), atol=0.03)
 
 
 def test_descriptors_are_square_roots() -> None:
     grey, _ = _blobs()
-    found = sift.find(grey, None, 1000)
-    assert found.descriptors.dtype == np.uint8
+    features = sift.find(grey, None, 1000)
+    assert features.descriptors.dtype == np.uint8
     # The elements' squares sum to 512 squared, but for rounding.
-    lengths = np.linalg.norm(found.descriptors.astype(np.float64), axis=1)
+    lengths = np.linalg.norm(features.descriptors.astype(np.float64), axis=1)
     np.testing.assert_allclose(lengths, 512.0, rtol=0.02)
 
 
@@ -66,9 +66,9 @@ def test_masked_pixels_have_no_features_and_take_no_place_of_others() -> None:
     mask = np.zeros(grey.shape, np.uint8)
     mask[HEIGHT // 2 :] = 255  # the fainter half
     assert len(sift.find(grey, mask, 12).points) == 12
-    found = sift.find(grey, mask, 1000)
-    assert (found.points[:, 1] >= HEIGHT // 2).all()
-    distances = np.linalg.norm(found.points - blobs[12:, None, :2], axis=2)
+    features = sift.find(grey, mask, 1000)
+    assert (features.points[:, 1] >= HEIGHT // 2).all()
+    distances = np.linalg.norm(features.points - blobs[12:, None, :2], axis=2)
     assert (distances.min(axis=1) < 0.1).all()
 
 
@@ -93,10 +93,10 @@ def test_a_mask_that_shows_everything_changes_nothing() -> None:
 @pytest.mark.parametrize("shape", [(1, 1), (1, 300), (300, 1), (3, 2), (HEIGHT, WIDTH)])
 def test_a_picture_without_contrast_or_size_has_no_features(shape: tuple[int, int]) -> None:
     for mask in (None, np.full(shape, 255, np.uint8), np.zeros(shape, np.uint8)):
-        found = sift.find(np.full(shape, 128, np.uint8), mask, 100)
-        assert found.points.shape == (0, 2)
-        assert found.scales.shape == (0,)
-        assert found.descriptors.shape == (0, 128)
+        features = sift.find(np.full(shape, 128, np.uint8), mask, 100)
+        assert features.points.shape == (0, 2)
+        assert features.scales.shape == (0,)
+        assert features.descriptors.shape == (0, 128)
 
 
 def test_pictures_are_searched_at_a_time_as_the_memory_allows(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -91,15 +91,15 @@ def test_what_is_planted_goes(life: Trained) -> None:
         spoilt = concatenate(spoilt, planted(kind, looking).padded(1))
         for photo in (view.full for view in looking):
             assert photo_psnr(spoilt, photo, BLACK) < photo_psnr(life.gaussians, photo, BLACK) - 0.05
-    found = life.cleaned(spoilt)
-    gone = ~found.keep
+    cleaning = life.cleaned(spoilt)
+    gone = ~cleaning.keep
     assert bool(gone[life.gaussians.count :].all())
     for number, kind in enumerate(KINDS, 1):
-        assert found.removed[kind] >= number
-    assert sum(found.removed.values()) == int(gone.sum())
+        assert cleaning.removed[kind] >= number
+    assert sum(cleaning.removed.values()) == int(gone.sum())
     # Held-out photos took no part in it, and are shown as without what was planted, or better.
-    assert life.psnr(spoilt.select(found.keep)) >= life.psnr(life.gaussians) - 0.02
-    assert found.psnr > found.psnr_before
+    assert life.psnr(spoilt.select(cleaning.keep)) >= life.psnr(life.gaussians) - 0.02
+    assert cleaning.psnr > cleaning.psnr_before
 
 
 @pytest.mark.slow
@@ -108,10 +108,10 @@ def test_what_photos_support_stays(life: Trained) -> None:
 
     Held-out photos decide nothing, and may lose a little.
     """
-    found = life.cleaned(life.gaussians)
-    gone = ~found.keep
-    assert found.psnr >= found.psnr_before
-    assert life.psnr(life.gaussians.select(found.keep)) >= life.psnr(life.gaussians) - 0.05
+    cleaning = life.cleaned(life.gaussians)
+    gone = ~cleaning.keep
+    assert cleaning.psnr >= cleaning.psnr_before
+    assert life.psnr(life.gaussians.select(cleaning.keep)) >= life.psnr(life.gaussians) - 0.05
     evidence = evidence_of(life.gaussians, life.photos, BLACK)
     heavy = evidence.support > 0.1 * evidence.support.max()
     assert int(heavy.sum()) > 10
@@ -133,10 +133,10 @@ def test_what_one_photo_needs_stays_and_the_others_go(life: Trained) -> None:
         for number, kind in enumerate(kinds)
     ]
     spoilt = concatenate(*harmful, spoilt)
-    found = clean(spoilt, photos, BLACK)
-    assert bool(found.keep[-1])
-    assert not bool(found.keep[: EACH * len(kinds)].any())
-    left = spoilt.select(found.keep)
+    cleaning = clean(spoilt, photos, BLACK)
+    assert bool(cleaning.keep[-1])
+    assert not bool(cleaning.keep[: EACH * len(kinds)].any())
+    left = spoilt.select(cleaning.keep)
     for photo in photos:
         assert photo_psnr(left, photo, BLACK) >= photo_psnr(spoilt, photo, BLACK) - MOST_LOST - 1e-3
 
@@ -145,9 +145,9 @@ def test_a_model_of_harmful_gaussians_alone_loses_all_of_them() -> None:
     training, _ = split()
     black = [view.full._replace(rgb=torch.zeros_like(view.full.rgb)) for view in training]
     harmful = planted("giant", training[-EACH:]).padded(1)
-    found = clean(harmful, black, BLACK)
-    assert not bool(found.keep.any())
-    assert sum(found.removed.values()) == found.unsupported == EACH
+    cleaning = clean(harmful, black, BLACK)
+    assert not bool(cleaning.keep.any())
+    assert sum(cleaning.removed.values()) == cleaning.unsupported == EACH
     nothing = clean(harmful.select(torch.zeros(0, dtype=torch.int64)), black, BLACK)
     assert nothing.keep.shape == (0,)
     assert not any(nothing.removed.values())

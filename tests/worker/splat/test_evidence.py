@@ -72,9 +72,9 @@ def test_weights_are_what_the_colour_of_a_gaussian_changes(
     gaussians: Gaussians, photos: list[Target]
 ) -> None:
     """A white Gaussian among black ones over black shows its own weight."""
-    found = evidence_of(gaussians, photos, GREY)
+    evidence = evidence_of(gaussians, photos, GREY)
     total = torch.zeros(gaussians.count, dtype=torch.float64)
-    peak, seen = torch.zeros_like(total), torch.zeros(gaussians.count, dtype=torch.int64)
+    peak, counts = torch.zeros_like(total), torch.zeros(gaussians.count, dtype=torch.int64)
     for photo in photos:
         for row in range(gaussians.count):
             sh = torch.full_like(gaussians.sh, -1e3)
@@ -85,13 +85,13 @@ def test_weights_are_what_the_colour_of_a_gaussian_changes(
             weight = (shown if photo.mask is None else shown[photo.mask]).sum()
             total[row] += weight
             peak[row] = torch.maximum(peak[row], weight)
-            seen[row] += int(weight >= HALF_LEVEL)
+            counts[row] += int(weight >= HALF_LEVEL)
     # float32 sums of up to 7,000 pixels in another order.
-    torch.testing.assert_close(found.weight, total, rtol=1e-4, atol=1e-3)
-    torch.testing.assert_close(found.peak, peak, rtol=1e-4, atol=1e-3)
-    assert torch.equal(found.photos, seen)
-    assert int(found.photos[-1]) == 0
-    assert float(found.weight[-1]) == 0.0
+    torch.testing.assert_close(evidence.weight, total, rtol=1e-4, atol=1e-3)
+    torch.testing.assert_close(evidence.peak, peak, rtol=1e-4, atol=1e-3)
+    assert torch.equal(evidence.photos, counts)
+    assert int(evidence.photos[-1]) == 0
+    assert float(evidence.weight[-1]) == 0.0
 
 
 def test_weights_add_up_over_photos_and_each_has_its_own_psnr(

@@ -46,8 +46,8 @@ def test_orbit_cameras_look_at_the_target() -> None:
     for camera in orbit.cameras_along(path, request, 50.0):
         rotation = camera.viewmat[:3, :3]
         assert rotation @ rotation.T == pytest.approx(np.eye(3), abs=1e-9)
-        seen = camera.project(path.target[None])
-        assert (*seen.columns, *seen.rows) == pytest.approx((32.0, 24.0), abs=1e-6)
+        projection = camera.project(path.target[None])
+        assert (*projection.columns, *projection.rows) == pytest.approx((32.0, 24.0), abs=1e-6)
         assert rotation[1] @ np.array([0.0, 0.0, 1.0]) < 0, "the picture's down must not be the world's up"
 
 

@@ -61,13 +61,13 @@ def true_depth() -> Tensor:
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
 @pytest.mark.parametrize("thickness", [1e-2, 1e-4, 1e-6])
 def test_a_tilted_plane_has_its_depth_and_its_normal(thickness: float, backend: ops.Backend) -> None:
-    seen, truth = surface(plane(thickness), CAMERA, backend=backend), true_depth()
+    maps, truth = surface(plane(thickness), CAMERA, backend=backend), true_depth()
     there = truth > 0
     assert there.sum() > 1000
-    error = (seen.depth.double() - truth).abs()[there]
+    error = (maps.depth.double() - truth).abs()[there]
     # The discs are 0.19 wide, half of which is a depth of 0.14 at this tilt.
     assert float(error.quantile(0.99)) < 0.02
-    cosine = (seen.normal.double() @ torch.from_numpy(NORMAL))[there]
+    cosine = (maps.normal.double() @ torch.from_numpy(NORMAL))[there]
     assert float(cosine.min()) > math.cos(math.radians(1.0))
 
 
@@ -99,6 +99,6 @@ def test_what_is_culled_has_no_plane() -> None:
 
 
 def test_nothing_has_no_surface() -> None:
-    seen = surface(plane(1e-3).select(torch.arange(0)), CAMERA)
-    assert not seen.depth.any()
-    assert not seen.normal.any()
+    maps = surface(plane(1e-3).select(torch.arange(0)), CAMERA)
+    assert not maps.depth.any()
+    assert not maps.normal.any()

@@ -52,9 +52,9 @@ def test_two_views_agree_where_both_see_a_diffuse_point() -> None:
     u, v, z, _ = second.project(points)
     inside = table & (u > 1) & (u < 159) & (v > 1) & (v < 119)
     row, column = v[inside].astype(int), u[inside].astype(int)
-    seen = np.abs(depth_b[row, column] - z[inside]) < 0.05
-    difference = np.abs(rgb_a.reshape(-1, 3)[inside].astype(float) - rgb_b[row, column]).mean(1)[seen]
-    assert seen.sum() > 1000
+    visible = np.abs(depth_b[row, column] - z[inside]) < 0.05
+    difference = np.abs(rgb_a.reshape(-1, 3)[inside].astype(float) - rgb_b[row, column]).mean(1)[visible]
+    assert visible.sum() > 1000
     # Resampling at integer pixels costs a few levels; a wrong pose costs tens.
     assert np.median(difference) < 12
 

@@ -47,13 +47,13 @@ def test_photos_are_read_as_they_were_written(tmp_path: Path) -> None:
     write_photos(tmp_path / "training", views)
     read = read_photos(tmp_path / "training")
     assert [view.name for view in read] == [view.name for view in views]
-    for found, given in zip(read, views, strict=True):
-        cameras = [each.full.camera for each in (found, given)]
+    for copy, original in zip(read, views, strict=True):
+        cameras = [each.full.camera for each in (copy, original)]
         assert len({(camera.width, camera.height) for camera in cameras}) == 1
         for matrix in ("viewmat", "K"):
             assert np.array_equal(*(getattr(camera, matrix) for camera in cameras))
         for name in ("viewmat", "K", "rgb", "alpha", "mask"):
-            one, other = (getattr(each.full, name) for each in (found, given))
+            one, other = (getattr(each.full, name) for each in (copy, original))
             assert (one is None) == (other is None)
             assert one is None or (one.dtype == other.dtype and torch.equal(one, other))
     write_photos(tmp_path / "held-out", [])

@@ -64,7 +64,7 @@ def test_what_only_the_cameras_need_is_not_done_once_they_are_there() -> None:
     assert scene.ready({"cameras": "done"}) == ["photos"]
     assert scene.ready({"cameras": "done", "photos": "done"}) == ["coarse"]
     assert scene.ready({"photos": "done"}) == ["features-1", "features-2"]
-    assert scene.wanted(dict.fromkeys(("cameras", "coarse"), "done")) == {
+    assert scene.pending(dict.fromkeys(("cameras", "coarse"), "done")) == {
         *("photos", "tile-1", "tile-2", "seam-1", "seam-2", "scene")
     }
     assert scene.needed({"cameras": "done", "coarse": "done"}) == {unit.name for unit in scene.units} - set(
@@ -78,9 +78,9 @@ def test_what_only_the_cameras_need_is_not_done_once_they_are_there() -> None:
 
 def test_options_that_cameras_follow_from_exist_and_a_plan_survives_json() -> None:
     assert set(CAMERA_OPTIONS) <= set(TrainOptions.model_fields)
-    given = plan(7, steps=300, holdout=5)
-    assert ScenePlan.from_dict(given.as_dict()) == given
+    scene = plan(7, steps=300, holdout=5)
+    assert ScenePlan.from_dict(scene.as_dict()) == scene
     with pytest.raises(ValueError, match="format 9"):
-        ScenePlan.from_dict({**given.as_dict(), "format": 9})
+        ScenePlan.from_dict({**scene.as_dict(), "format": 9})
     with pytest.raises(KeyError):
-        given.unit("tile-8")
+        scene.unit("tile-8")

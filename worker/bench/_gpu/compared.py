@@ -91,10 +91,10 @@ def _loaded(capture: Path, size: int) -> tuple[Any, list[Any], list[Any], Any]:
     from splatmill_worker.splat.start.points import from_points
     from splatmill_worker.splat.views import TrainingView
 
-    found = posed.find(capture)
-    if found is None:
+    poses = posed.find(capture)
+    if poses is None:
         raise ValueError(f"{capture} has no cameras: give a folder with a COLMAP model or transforms.json.")
-    scene = found.load()
+    scene = poses.load()
     frame = Normalization.of(scene)
     world = frame.apply(scene)
     chosen, kept = split(scene)

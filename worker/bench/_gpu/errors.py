@@ -38,8 +38,8 @@ def definition(
     color, _, _ = reference.composite(fields, bins, view.width, view.height)
     loss = reference.loss(color, view.photo, mask=mask)
     loss.backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
-    found = [torch.zeros_like(x) if x.grad is None else x.grad for x in leaves]
-    named = zip(GROUPS.items(), found, strict=True)
+    slopes = [torch.zeros_like(x) if x.grad is None else x.grad for x in leaves]
+    named = zip(GROUPS.items(), slopes, strict=True)
     return float(loss.detach()), {name: g.double().reshape(-1, width) for (name, width), g in named}
 
 
@@ -79,11 +79,11 @@ def prove(place: Place) -> Iterator[Row]:
                 torch.cuda.set_sync_debug_mode("default")
         loss = step.train(view.viewmat, view.K, view.photo, step=3, **more).loss
         shares = {}
-        for name, seen in gradients(step, degree).items():
-            wanted = truth[name]
-            spread = float((plain[name] - wanted).abs().max())
-            allowed = 8 * spread + 64 * 2.0**-24 * float(wanted.abs().max())
-            shares[name] = float((seen - wanted).abs().max()) / max(allowed, 1e-300)
+        for name, gradient in gradients(step, degree).items():
+            true = truth[name]
+            spread = float((plain[name] - true).abs().max())
+            allowed = 8 * spread + 64 * 2.0**-24 * float(true.abs().max())
+            shares[name] = float((gradient - true).abs().max()) / max(allowed, 1e-300)
         passed = max(shares.values()) <= 1 and abs(loss - exact) <= 1e-5 and not waits
         yield {
             "gaussians": n, "degree": degree, "antialias": antialias, "masked": masked, "passed": passed,
@@ -115,12 +115,12 @@ def needles(place: Place) -> Iterator[Row]:
             )
             color = image.cpu().double()
             by_group = step.gradients(problem.weights.float())
-            found = {"image": color, **{k: x.cpu().double() for k, x in by_group.items()}}
+            outputs = {"image": color, **{k: x.cpu().double() for k, x in by_group.items()}}
             exact = {"image": problem.exact.image, **problem.exact.gradients}
             unit = {"image": problem.unit.image, **problem.unit.gradients}
             kept = ~problem.undecided
-            for name, seen in found.items():
-                share = (seen - exact[name].reshape(seen.shape)).abs() / unit[name].reshape(seen.shape)
+            for name, output in outputs.items():
+                share = (output - exact[name].reshape(output.shape)).abs() / unit[name].reshape(output.shape)
                 share = share[kept] if name == "image" else share
                 yield {
                     "where": where, "ratio": ratio, "value": name,

@@ -128,5 +128,5 @@ def order(views: int, steps: int, seed: int) -> Sequence[int]:
     """The view of each step: a random permutation of all views, repeated."""
     g = torch.Generator().manual_seed(seed)
     rounds = [torch.randperm(views, generator=g) for _ in range(-(-steps // views))]
-    found: list[int] = torch.cat(rounds)[:steps].tolist()
-    return found
+    numbers: list[int] = torch.cat(rounds)[:steps].tolist()
+    return numbers

@@ -105,13 +105,13 @@ def measure(place: Place) -> Iterator[Row]:
     d_color = compare()[1]
     assert d_color is not None
     gradient = blend_backward(records, made.bins, image, *size, d_color)
-    seen, last = made.shown.to(torch.uint8), torch.zeros(n, dtype=torch.int32, device=place.device)
+    visible, last = made.shown.to(torch.uint8), torch.zeros(n, dtype=torch.int32, device=place.device)
     refused = torch.zeros(1, dtype=torch.int32, device=place.device)
     first, second = (torch.zeros_like(step._params) for _ in range(2))
     scored = step._shown(view.viewmat, view.K, *size, DEGREE, None, False, 0.01, depth=False, whole=False)
 
     def update() -> None:
-        missed = adam.CatchUp(seen, last, 1, BETA2)
+        missed = adam.CatchUp(visible, last, 1, BETA2)
         adam.apply_planes(
             step._params, step._gradient, first, second, [0.0] * 6, FLOATS, 1, BETA2, refused, missed
         )  # fmt: skip

@@ -42,12 +42,12 @@ def of_sparse_points(cameras_zip: Path) -> Mesh:
         with ZipFile(cameras_zip) as archive:
             archive.extractall(folder)
         model = pycolmap.Reconstruction(Path(folder) / "sparse" / "0")
-    found = list(model.points3D.values())
-    points = np.array([point.xyz for point in found])
+    sparse = list(model.points3D.values())
+    points = np.array([point.xyz for point in sparse])
     seen_from = np.array(
         [
             np.mean([model.images[e.image_id].projection_center() for e in point.track.elements], axis=0)
-            for point in found
+            for point in sparse
         ]
     )
     _, rows = cKDTree(points).query(points, NEIGHBOURS)
@@ -77,9 +77,9 @@ def by_open3d(views: Sequence[View], voxel: float, most: float) -> Mesh:
         color = image(tensor(view.color.numpy().astype(np.float32) / 255))
         blocks = grid.compute_unique_block_coordinates(depth, inner, outer, 1.0, most, TRUNCATION)
         grid.integrate(blocks, depth, color, inner, outer, 1.0, most, TRUNCATION)
-    found = grid.extract_triangle_mesh(weight_threshold=LEAST_VIEWS).to_legacy()
+    surface = grid.extract_triangle_mesh(weight_threshold=LEAST_VIEWS).to_legacy()
     return Mesh(
-        np.asarray(found.vertices, np.float32),
-        np.asarray(found.triangles, np.int32),
-        (255 * np.asarray(found.vertex_colors)).astype(np.uint8),
+        np.asarray(surface.vertices, np.float32),
+        np.asarray(surface.triangles, np.int32),
+        (255 * np.asarray(surface.vertex_colors)).astype(np.uint8),
     )

@@ -32,7 +32,7 @@ TOP, BOTTOM = 1.3, -0.05
 SAMPLES = 200_000
 """Points on each of the two surfaces. On the truth, which has 16 square units, they are 0.009 apart."""
 
-SEEN = 2
+MIN_CAMERAS = 2
 """Cameras that must see a point of the truth."""
 
 
@@ -40,19 +40,19 @@ def scores(mesh: Mesh, truth: Float, life: StillLife) -> dict[str, float]:
     """Chamfer distance (mean of both means, world units), and precision, recall and F-score at SHARES of the size."""
     samples = on_mesh(mesh)
     samples = samples[within(samples)]
-    found: dict[str, float] = {}
+    figures: dict[str, float] = {}
     if not len(samples):
         names = ("precision", "completeness", "f")
         return {"chamfer": math.inf} | {f"{name}_{share:g}": 0.0 for name in names for share in SHARES}
     to_truth = distances(samples, life.solids)
     to_mesh = cKDTree(samples).query(truth)[0]
-    found["chamfer"] = float(to_truth.mean() + to_mesh.mean()) / 2
+    figures["chamfer"] = float(to_truth.mean() + to_mesh.mean()) / 2
     for share in SHARES:
         precision = float((to_truth < share * SIZE).mean())
         recall = float((to_mesh < share * SIZE).mean())
-        found[f"precision_{share:g}"], found[f"completeness_{share:g}"] = precision, recall
-        found[f"f_{share:g}"] = 2 * precision * recall / max(precision + recall, 1e-12)
-    return found
+        figures[f"precision_{share:g}"], figures[f"completeness_{share:g}"] = precision, recall
+        figures[f"f_{share:g}"] = 2 * precision * recall / max(precision + recall, 1e-12)
+    return figures
 
 
 def within(points: Float) -> npt.NDArray[np.bool_]:
@@ -77,17 +77,17 @@ def on_mesh(mesh: Mesh) -> Float:
 
 
 def visible(life: StillLife, cameras: Sequence[Camera]) -> Float:
-    """Points [n, 3] of the true surface over the table that SEEN cameras see, evenly by area."""
+    """Points [n, 3] of the true surface over the table that MIN_CAMERAS cameras see, evenly by area."""
     random = np.random.default_rng(1)
     solids = [solid for solid in life.solids if not isinstance(solid, Disc) or solid.z == 0.0]
     areas = np.array([area(solid) for solid in solids])
     counts = (SAMPLES * areas / areas.sum()).astype(int)
     points = np.concatenate([on_solid(s, n, random) for s, n in zip(solids, counts, strict=True)])
     points = points[within(points)]
-    seen = np.zeros(len(points), int)
+    sightings = np.zeros(len(points), int)
     for camera in cameras:
-        seen += camera.project(points).inside & unhidden(life, camera, points)
-    return points[seen >= SEEN]
+        sightings += camera.project(points).inside & unhidden(life, camera, points)
+    return points[sightings >= MIN_CAMERAS]
 
 
 def unhidden(life: StillLife, camera: Camera, points: Float) -> npt.NDArray[np.bool_]:

@@ -30,7 +30,7 @@ def ablation(rows: list[Row]) -> str:
         return "".join(left)
     order = {name: number for number, name in enumerate(CONFIGURATIONS)}
     places = sorted(pairs, key=lambda place: (order.get(place[2], len(order)), place))
-    quality = {place: found for place in places if (found := difference(pairs[place], "psnr")) is not None}
+    quality = {place: spread for place in places if (spread := difference(pairs[place], "psnr")) is not None}
     head = "switch|what|scene|budget|seeds|PSNR, dB|SSIM|training time, %|quality against the default"
     parts = [
         ONE_SWITCH,
@@ -66,12 +66,12 @@ def summary(quality: dict[Place, Spread]) -> str:
     """A table with a row per switch: where it was better or worse, and the median difference there."""
     lines = []
     for config in dict.fromkeys(config for _, _, config in quality):
-        mine = {f"{place[0]}, {place[1]}": found for place, found in quality.items() if place[2] == config}
+        mine = {f"{place[0]}, {place[1]}": spread for place, spread in quality.items() if place[2] == config}
         where = [
-            "; ".join(place for place, found in mine.items() if verdict(found) == word) or "nowhere"
+            "; ".join(place for place, spread in mine.items() if verdict(spread) == word) or "nowhere"
             for word in ("better", "worse")
         ]
-        over = Spread.of(found.median for found in mine.values())
+        over = Spread.of(spread.median for spread in mine.values())
         lines.append([f"`{config}`", len(mine), *where, over.text(2, signed=True)])
     return table("switch|places|better on|worse on|PSNR over the places: median of medians, dB", lines)
 
@@ -119,7 +119,7 @@ def _line(place: Place, pairs: list[Pair]) -> list[object]:
 def _idle(pairs: dict[Place, list[Pair]]) -> list[str]:
     """A sentence that names the switches not measured on a scene because its plan already has them."""
     asked = {config for _, _, config in pairs} & CONFIGURATIONS.keys()
-    found: dict[str, list[str]] = {}
+    by_config: dict[str, list[str]] = {}
     for (scene, budget), group in grouped(
         (default for pair in pairs.values() for default, _ in pair), "scene", "budget"
     ).items():
@@ -127,10 +127,10 @@ def _idle(pairs: dict[Place, list[Pair]]) -> list[str]:
             plans = [row["plan"] for row in whole(group)]
             there = (scene, budget, config) in pairs
             if plans and not there and not any(CONFIGURATIONS[config].changes(plan) for plan in plans):
-                found.setdefault(config, []).append(f"{scene} at {budget}")
-    if not found:
+                by_config.setdefault(config, []).append(f"{scene} at {budget}")
+    if not by_config:
         return []
-    said = "; ".join(f"`{config}` on {', '.join(places)}" for config, places in found.items())
+    said = "; ".join(f"`{config}` on {', '.join(places)}" for config, places in by_config.items())
     return [f"Not measured, since the default's plan is that already: {said}."]
 
 

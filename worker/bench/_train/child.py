@@ -75,5 +75,5 @@ def _ask(job: Row) -> Row:
             raise Fault(
                 f"the process ended with status {done.returncode} and left no row:\n{done.stderr[-LAST_WORDS:]}"
             )
-        found: Row = json.loads(answer.read_text())
-        return found
+        row: Row = json.loads(answer.read_text())
+        return row

@@ -47,9 +47,9 @@ class Configuration:
 
     def changes(self, plan: dict[str, Any]) -> bool:
         """Whether the switch makes another plan of a row's plan, in which what is off or None is absent."""
-        wanted = self.gives | self.plan
-        return not wanted or any(
-            (_at(plan, path) or None) != (value or None) for path, value in wanted.items()
+        settings = self.gives | self.plan
+        return not settings or any(
+            (_at(plan, path) or None) != (value or None) for path, value in settings.items()
         )
 
 

@@ -27,9 +27,9 @@ def expected(run: BenchRun, rows: list[Row]) -> float:
     """Expected wall seconds of a run: the median of like runs, else an estimate from its budget."""
     like = (run.scene.name, run.budget.name)
     known = [row for row in rows if row["kind"] == "run" and not failed(row)]
-    took = [row["wall_seconds"] for row in known if (row["scene"], row["budget"]) == like]
-    if took:
-        return START + float(statistics.median(took))
+    times = [row["wall_seconds"] for row in known if (row["scene"], row["budget"]) == like]
+    if times:
+        return START + float(statistics.median(times))
     if run.budget.steps is not None:
         return START + AROUND + PER_STEP * run.budget.steps
     assert run.budget.seconds is not None

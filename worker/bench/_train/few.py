@@ -64,12 +64,12 @@ def _thinned(scene: Scene, chosen: Sequence[View]) -> Scene:
     places = {view.name: at for at, view in enumerate(chosen)}
     renumbered = np.array([places.get(view.name, -1) for view in scene.views], np.int32)
     tracks = [
-        seen[seen >= 0]
-        for seen in np.split(renumbered[scene.point_views.views], scene.point_views.offsets[1:-1])
+        track[track >= 0]
+        for track in np.split(renumbered[scene.point_views.views], scene.point_views.offsets[1:-1])
     ]
-    kept = np.array([len(seen) >= 2 for seen in tracks])
-    tracks = [seen for seen, keep in zip(tracks, kept, strict=True) if keep]
-    lengths = np.array([len(seen) for seen in tracks], np.int32)
+    kept = np.array([len(track) >= 2 for track in tracks])
+    tracks = [track for track, keep in zip(tracks, kept, strict=True) if keep]
+    lengths = np.array([len(track) for track in tracks], np.int32)
     return replace(
         scene,
         views=tuple(chosen),

@@ -60,15 +60,15 @@ def without_outliers(run: TrainingRun, learnt: Sequence[int]) -> tuple[Disagreem
 
     The training photos that are measured at the end are measured without these pixels too.
     """
-    found = disagreements(run, learnt)
-    _mask(run, {each.name: ~each.outliers for each in found})
-    return found
+    photos = disagreements(run, learnt)
+    _mask(run, {each.name: ~each.outliers for each in photos})
+    return photos
 
 
 def without_named_photos(run: TrainingRun, learnt: Sequence[int]) -> tuple[Disagreement, ...]:
     """In place of `disagreements`: no step from here on is taken on photos that disagree for a reason."""
-    found = disagreements(run, learnt)
-    named = {each.name for each in found if each.reason is not None}
+    photos = disagreements(run, learnt)
+    named = {each.name for each in photos if each.reason is not None}
     left = [index for index, view in enumerate(run.views) if view.name not in named]
     if named and left:
         following = run._next_view
@@ -80,7 +80,7 @@ def without_named_photos(run: TrainingRun, learnt: Sequence[int]) -> tuple[Disag
             return index
 
         vars(run)["_next_view"] = next_left
-    return found
+    return photos
 
 
 def trained_and_cleaned(

@@ -21,9 +21,9 @@ def judged(truth: Path, photos: Sequence[Disagreement]) -> Row | None:
     """
     if not truth.is_dir():
         return None
-    found = right = there = 0.0
+    outliers = right = there = 0.0
     for photo in photos:
-        found += photo.share
+        outliers += photo.share
         path = (truth / photo.name).with_suffix(".png")
         if path.is_file():
             whole = torch.from_numpy(np.asarray(own_picture(path), dtype=np.float32))
@@ -32,7 +32,7 @@ def judged(truth: Path, photos: Sequence[Disagreement]) -> Row | None:
             there += float(moved.float().mean())
             right += float((photo.outliers & moved).float().mean())
     return {
-        "precision": right / found if found else None,
+        "precision": right / outliers if outliers else None,
         "recall": right / there if there else None,
         "planted": there / len(photos) if photos else None,
     }

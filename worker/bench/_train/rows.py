@@ -174,14 +174,14 @@ def compared(rows: list[Row]) -> dict[tuple[str, str, str], list[Pair]]:
     Of several codes the last one counts that has both.
     """
     defaults, others = _sides(rows)
-    found: dict[tuple[str, str, str], list[Pair]] = {}
+    by_place: dict[tuple[str, str, str], list[Pair]] = {}
     for row in others:
         if _place(row) in defaults:
-            group = found.setdefault((row["scene"], row["budget"], row["config"]), [])
+            group = by_place.setdefault((row["scene"], row["budget"], row["config"]), [])
             group.append((defaults[_place(row)], row))
     return {
         group: [pair for pair in pairs if pair[1]["code"] == pairs[-1][1]["code"]]
-        for group, pairs in found.items()
+        for group, pairs in by_place.items()
     }
 
 

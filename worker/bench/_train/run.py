@@ -102,8 +102,10 @@ def measure(job: Row) -> Row:
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
         others = max(0.0, worked() - machine - cpu)
         report = json.loads((outcome.out / "report.json").read_text())
-        found = None if outcome.trained is None else judged(capture / TRUTH, outcome.trained.disagreements)
-        seen = {} if outcome.trained is None else _perceived(job, options, outcome.trained.gaussians)
+        disagreement = (
+            None if outcome.trained is None else judged(capture / TRUTH, outcome.trained.disagreements)
+        )
+        perception = {} if outcome.trained is None else _perceived(job, options, outcome.trained.gaussians)
     result, seconds = report["result"], report["seconds"]
     recovered = report["sfm"].get("seconds", {})
     values = {
@@ -119,8 +121,8 @@ def measure(job: Row) -> Row:
         "size": [report["facts"]["width"], report["facts"]["height"]],
         "plan": {name: value for name, value in report["plan"].items() if name != "reasons"},
         "warnings": report["warnings"],
-        "disagreement": found,
-        **seen,
+        "disagreement": disagreement,
+        **perception,
         "curve": report["curve"],
     }  # fmt: skip
     measured: Row = rounded(values)
@@ -183,10 +185,10 @@ def asked(job: Row) -> TrainOptions:
     clocked apart, so that a limited time is no reason to leave LPIPS out.
     """
     options = TrainOptions.model_validate(job["identity"]["options"] | job["budget"])
-    wanted: dict[str, Any] = {"lpips": Switch.auto if lpips_weights.absence() else Switch.on}
+    changes: dict[str, Any] = {"lpips": Switch.auto if lpips_weights.absence() else Switch.on}
     if posed.find(Path(job["capture"])) is not None:
-        wanted["seed"] = job["identity"]["seed"]
-    return options.model_copy(update=wanted)
+        changes["seed"] = job["identity"]["seed"]
+    return options.model_copy(update=changes)
 
 
 def _perceived(job: Row, options: TrainOptions, gaussians: Gaussians) -> Row:

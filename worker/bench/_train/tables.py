@@ -20,7 +20,7 @@ TOLERANCE = 0.05
 
 COMMAND = "splatmill bench train"
 
-SEEN = {"ms_ssim": "MS-SSIM", "flip": "FLIP"}
+PERCEIVED = {"ms_ssim": "MS-SSIM", "flip": "FLIP"}
 """Errors as people see them, with their heads."""
 
 LPIPS = {"lpips_vgg": "LPIPS, VGG-16", "lpips_alex": "LPIPS, AlexNet"}
@@ -47,7 +47,7 @@ def document(rows: list[Row], references: list[Row], rows_at: Path, here: Path, 
         *section("Other trainers' models, judged on the same views", peers(rows)),
         *section("Cameras without points", without_points(rows)),
         *section("A scan to start from", with_scan(rows)),
-        *section("Photos that disagree", found(rows)),
+        *section("Photos that disagree", disagreements(rows)),
         *section("One switch at a time", ablation(rows)),
         *section("What was left out", left_out(rows)),
         *section("Failed runs, which get no point", failures(rows)),
@@ -60,10 +60,10 @@ def budgets(timed: list[Row]) -> str:
     """A table of the result of each time budget, and whether runs ended in time and never got worse with more time."""
     shown = [row for row in whole(timed) if by_time(row)]
     groups = grouped(shown, "scene", "budget")
-    seen = SEEN | {
+    columns = PERCEIVED | {
         name: head for name, head in LPIPS.items() if any(row.get(name) is not None for row in shown)
     }
-    quality_of = "|".join(["PSNR dB|SSIM", *seen.values()])
+    quality_of = "|".join(["PSNR dB|SSIM", *columns.values()])
     head = (
         f"scene|budget|seeds|training s|{quality_of}|Gaussians|steps|all wall s|all CPU s|peak MB|cameras s"
     )
@@ -87,7 +87,7 @@ def budgets(timed: list[Row]) -> str:
                 spent.text(1),
                 quality.text(2),
                 Spread.of(row["ssim"] for row in group).text(4),
-                *(_median(group, name) for name in seen),
+                *(_median(group, name) for name in columns),
                 *(f"{Spread.of(row[name] for row in group).median:.0f}" for name in ("gaussians", "steps")),
                 *(
                     f"{Spread.of(row[name] for row in group).median:.0f}"
@@ -124,15 +124,15 @@ def levels(timed: list[Row], references: list[Row]) -> str:
     lines = []
     for level in asked:
         scene, psnr = level["scene"], level["psnr"]
-        found: list[tuple[Spread, str]] = []
+        candidates: list[tuple[Spread, str]] = []
         for (budget,), group in grouped(_of_scene(timed, scene), "budget").items():
             reached = [seconds_to(row["curve"], psnr) for row in group]
             known = [seconds for seconds in reached if seconds is not None]
             if len(known) == len(reached):
-                found.append((Spread.of(known), budget))
+                candidates.append((Spread.of(known), budget))
         if not _of_scene(timed, scene):
             continue
-        best = min(found, key=lambda place: place[0].median) if found else None
+        best = min(candidates, key=lambda place: place[0].median) if candidates else None
         elsewhere = [
             next(
                 (
@@ -204,8 +204,8 @@ def peers(rows: list[Row]) -> str:
 def without_points(rows: list[Row]) -> str:
     """A table of captures that have cameras and no points, each beside the same capture with its points."""
     lines = []
-    for scene, budget, without, having, given in _beside(rows, bare.WITH_POINTS):
-        mine, theirs = (Spread.of(row["psnr"] for row in group) for group in (without, given))
+    for scene, budget, without, having, others in _beside(rows, bare.WITH_POINTS):
+        mine, theirs = (Spread.of(row["psnr"] for row in group) for group in (without, others))
         loss = f"{mine.median - theirs.median:+.2f}"
         lines.append([scene, budget, len(without), mine.text(2), having, theirs.text(2), loss])
     head = "cameras alone|budget|seeds|PSNR dB|the same with points|PSNR dB|difference, dB"
@@ -242,7 +242,7 @@ def _beside(
             yield scene, budget, groups[scene, budget, code], others[scene], other
 
 
-def found(rows: list[Row]) -> str:
+def disagreements(rows: list[Row]) -> str:
     """A table of how many of the planted pixels the default's runs found."""
     ours = once([row for row in rows if row["kind"] == "run" and row["config"] == DEFAULT])
     planted = [row for row in ours if row.get("disagreement")]

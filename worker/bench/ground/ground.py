@@ -123,7 +123,7 @@ def used(usage: Usage) -> Row:
 
 def camera_errors(cameras: Path, truth: Path) -> Row:
     """Number of cameras, and their median and largest errors in degrees and metres after the best similarity."""
-    found = {
+    poses = {
         each["name"]: np.array(each["camera"]["camera_to_world"])
         for each in json.loads(cameras.read_text())["cameras"]
     }
@@ -131,14 +131,14 @@ def camera_errors(cameras: Path, truth: Path) -> Row:
         image.name: np.linalg.inv(np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]))
         for image in pycolmap.Reconstruction(truth).images.values()
     }
-    ours, theirs = np.array(list(found.values())), np.array([true[name] for name in found])
+    ours, theirs = np.array(list(poses.values())), np.array([true[name] for name in poses])
     distance, turn = aligned(ours[:, :3, 3], theirs[:, :3, 3])
     cosines = (
         np.trace(np.swapaxes(turn @ ours[:, :3, :3], 1, 2) @ theirs[:, :3, :3], axis1=1, axis2=2) - 1
     ) / 2
     angles = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
     return {
-        "cameras": len(found),
+        "cameras": len(poses),
         "rotation_deg": round(float(np.median(angles)), 4), "rotation_deg_max": round(float(angles.max()), 4),
         "metres": round(float(np.median(distance)), 4), "metres_max": round(float(distance.max()), 4),
     }  # fmt: skip
@@ -228,11 +228,11 @@ def growth(rows: list[Row]) -> str:
     """One sentence for each way."""
     sentences = []
     for way in WAYS:
-        found = {
+        powers = {
             words: exponent(of(rows, way=way), name)
             for name, words in (("cpu", "CPU seconds"), ("seconds", "wall seconds"), ("memory", "memory"))
         }
-        known = [f"{words} as photos^{power:.2f}" for words, power in found.items() if power is not None]
+        known = [f"{words} as photos^{power:.2f}" for words, power in powers.items() if power is not None]
         if known:
             counts = ", ".join(str(count) for count in distinct(of(rows, way=way), "photos"))
             sentences.append(f"{way[0].upper()}{way[1:]}, by {counts} photos: {', '.join(known)}.")

@@ -75,12 +75,12 @@ def measured(options: argparse.Namespace) -> Iterator[Row | str]:
             if "scene" not in plan.states():
                 yield f"{count} processes did not finish the scene: {workers[0].lines[-1]}"
                 return
-            wanted = first_with.setdefault(workers[0].threads, model_of(plan))
-            yield row | {"workers": count, "disturbed": None} | found(plan, workers, seconds, wanted)
+            digest = first_with.setdefault(workers[0].threads, model_of(plan))
+            yield row | {"workers": count, "disturbed": None} | outcome(plan, workers, seconds, digest)
         for seed in range(options.disturbed):
             plan = copied(folder, scene, f"disturbed-{seed}", known)
             workers, seconds, events = disturbed(plan, random.Random(seed), max(1, options.cores // 2))
-            fields = found(plan, workers, seconds, first_with.get(workers[0].threads))
+            fields = outcome(plan, workers, seconds, first_with.get(workers[0].threads))
             yield row | {"workers": 2, "disturbed": seed, "events": events} | fields
 
 
@@ -162,8 +162,8 @@ def model_of(plan: PlanFolder) -> str:
     return hashlib.sha256((scene / "model.ply").read_bytes()).hexdigest()
 
 
-def found(plan: PlanFolder, workers: Sequence[Worker], seconds: float, wanted: str | None) -> Row:
-    """The fields of a plan that is done. wanted: the digest of the model of the first plan with as many threads that
+def outcome(plan: PlanFolder, workers: Sequence[Worker], seconds: float, digest: str | None) -> Row:
+    """The fields of a plan that is done. digest: that of the model of the first plan with as many threads that
     nobody disturbed; None without one.
     """
     ended = {name: end.path for name, end in plan.ended().items() if end.path is not None}
@@ -180,7 +180,7 @@ def found(plan: PlanFolder, workers: Sequence[Worker], seconds: float, wanted: s
         "chain": round(units["coarse"] + longest + units["scene"], 1),
         "again": {name: count for name, count in begun.items() if count > 1},
         "outputs": len([path for path in (plan.root / "units").iterdir() if path.is_dir()]),
-        "same": None if wanted is None else model_of(plan) == wanted,
+        "same": None if digest is None else model_of(plan) == digest,
     }
 
 

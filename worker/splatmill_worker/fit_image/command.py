@@ -37,15 +37,16 @@ class InterruptedWhileWriting(KeyboardInterrupt):
 
 def main(photo: Path, out: Path, options: str) -> int:
     """Run from the command line, with FitImageOptions as JSON; returns the exit status."""
-    wanted = FitImageOptions.model_validate_json(options)
+    settings = FitImageOptions.model_validate_json(options)
     try:
-        result = fit_image(photo, out, wanted, lambda line: print(line, flush=True))
+        result = fit_image(photo, out, settings, lambda line: print(line, flush=True))
     except Refusal as refusal:
         print(f"Error: {refusal.message}\n{refusal.advice}", file=sys.stderr)
         return REFUSED
     except TrainingFailed as failure:
         print(
-            f"Error: Fitting stopped at step {failure.step}: {failure.seen} {FAILED_ADVICE}", file=sys.stderr
+            f"Error: Fitting stopped at step {failure.step}: {failure.symptom} {FAILED_ADVICE}",
+            file=sys.stderr,
         )
         return FAILED
     except (OSError, av.FFmpegError) as error:

@@ -73,11 +73,11 @@ class FittedWaves:
         if count <= 0:
             return
         of_field = (field[free] for field in projected)
-        energy, found = strongest(Projected(*of_field), residual)
+        energy, waves = strongest(Projected(*of_field), residual)
         best = energy.topk(count).indices.sort().values
         rows = rows.clone()
         rows[free[best]] = torch.arange(len(values), len(values) + count, dtype=torch.int32)
-        self.waves = Waves(torch.cat([values, found[best]]), rows)
+        self.waves = Waves(torch.cat([values, waves[best]]), rows)
         zeros = torch.zeros(count, 6)
         self._exp_avg = torch.cat([self._exp_avg, zeros])
         self._exp_avg_sq = torch.cat([self._exp_avg_sq, zeros])

@@ -152,17 +152,17 @@ def copies(
         ),
     )
     kept: set[int] = set()
-    found: dict[int, int] = {}
+    originals: dict[int, int] = {}
     likely = _likely(pictures)
     for done, index in enumerate(ranked, 1):
         for other, turns in likely.get(index, ()):
             if other in kept and is_copy(pictures[index], pictures[other], turns):
-                found[index] = other
+                originals[index] = other
                 break
         else:
             kept.add(index)
         on_compared(done)
-    return found
+    return originals
 
 
 def warning(originals: Sequence[tuple[str, str]]) -> list[str]:
@@ -301,7 +301,7 @@ def _nearest(grids: Grey, sizes: Kinds, stems: Kinds) -> dict[int, list[tuple[in
     flat = grids.reshape(count, -1)
     # Most captures have photos of one size and no two of one name: then one limit holds for all pairs.
     mixed = len(np.unique(sizes)) > 1 or len(np.unique(stems)) < count
-    found: dict[int, list[tuple[float, int, int]]] = {}
+    partners: dict[int, list[tuple[float, int, int]]] = {}
     for turns in range(4):
         turned = np.rot90(grids, turns, axes=(1, 2)).reshape(flat.shape)
         for start in range(0, count, ROWS):
@@ -321,9 +321,11 @@ def _nearest(grids: Grey, sizes: Kinds, stems: Kinds) -> dict[int, list[tuple[in
                 if not len(alike):
                     break
                 for at in alike:
-                    found.setdefault(int(rows[at]), []).append((-float(best[at]), int(partner[at]), turns))
+                    partners.setdefault(int(rows[at]), []).append((-float(best[at]), int(partner[at]), turns))
                 similar[np.arange(len(rows)), partner] = -1.0
-    return {index: [(partner, turns) for _, partner, turns in sorted(each)] for index, each in found.items()}
+    return {
+        index: [(partner, turns) for _, partner, turns in sorted(each)] for index, each in partners.items()
+    }
 
 
 def _kinds(values: Sequence[Hashable]) -> Kinds:

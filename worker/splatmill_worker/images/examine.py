@@ -85,7 +85,7 @@ def examine(path: Path, name: str) -> Picture | str:
                 width, height = upright_size(image)
                 several = guarded.several(image)
                 colors = PhotoColors.of(image, tags(image), path).remark(image.mode)
-                found, stated = exif.read(image), panoramas.stated(image)
+                exif_tags, stated = exif.read(image), panoramas.stated(image)
                 if stated not in ("", "stated"):
                     return stated
                 turn = UPRIGHT.get(orientation(image))
@@ -108,4 +108,4 @@ def examine(path: Path, name: str) -> Picture | str:
         return error.reason + (GIVE if error.reason == guarded.UNKNOWN else "")
     except OSError as error:
         return f"it cannot be read: {plain(error)}"
-    return Picture(width, height, found, several, colors, grey, sphere, alpha, kind)
+    return Picture(width, height, exif_tags, several, colors, grey, sphere, alpha, kind)

@@ -45,9 +45,9 @@ class Exif:
 
 def read(image: Image.Image) -> Exif:
     """The tags of an opened image; unreadable EXIF counts as absent."""
-    found = tags(image)
+    entries = tags(image)
     try:
-        details, gps = found.get_ifd(EXIF_IFD), found.get_ifd(GPS_IFD)
+        details, gps = entries.get_ifd(EXIF_IFD), entries.get_ifd(GPS_IFD)
     except DECODE_ERRORS:
         return Exif()
     equivalent = _positive(details.get(FOCAL_LENGTH_35MM))
@@ -62,8 +62,8 @@ def read(image: Image.Image) -> Exif:
     if altitude is not None and gps.get(5) in (1, b"\x01"):
         altitude = -altitude
     return Exif(
-        make=_text(found.get(MAKE)),
-        model=_text(found.get(MODEL)),
+        make=_text(entries.get(MAKE)),
+        model=_text(entries.get(MODEL)),
         lens=_text(details.get(LENS_MODEL)),
         focal_length=_positive(details.get(FOCAL_LENGTH)),
         focal_in_diagonals=None if equivalent is None else equivalent / FULL_FRAME_DIAGONAL,

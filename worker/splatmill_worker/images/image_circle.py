@@ -96,12 +96,12 @@ def circle_in(brightest: Grey) -> Circle | None:
 
 def _border(bright: npt.NDArray[np.bool_]) -> npt.NDArray[np.float64]:
     """Where the first and the last bright pixel of each row and column begins and ends, within the picture [n,2]."""
-    found = []
+    points = []
     for across, pixels in ((0, bright), (1, bright.T)):
         lines = np.flatnonzero(pixels.any(axis=1))
         size = pixels.shape[1]
         first, last = pixels[lines].argmax(axis=1), size - pixels[lines, ::-1].argmax(axis=1)
         for place, kept in ((first, first > 0), (last, last < size)):
             ends = np.stack([place[kept].astype(np.float64), lines[kept] + 0.5], axis=1)
-            found.append(ends if across == 0 else ends[:, ::-1])
-    return np.concatenate(found)
+            points.append(ends if across == 0 else ends[:, ::-1])
+    return np.concatenate(points)

@@ -109,11 +109,11 @@ def _zoom_of(lens: Lens) -> _Zoom:
 
     def reach(zoom: float) -> tuple[bool, float]:
         """Whether the border at this zoom lies within the photo, and its largest distance from the principal point."""
-        seen = distort(lens, _ahead(rays / zoom))
-        low, high = seen.min(axis=0), seen.max(axis=0)
+        positions = distort(lens, _ahead(rays / zoom))
+        low, high = positions.min(axis=0), positions.max(axis=0)
         # Up to half a pixel beyond the border, the nearest pixel is still one of the border.
         inside = bool(low.min() >= -0.5 and high[0] <= lens.width + 0.5 and high[1] <= lens.height + 0.5)
-        return inside, float(np.linalg.norm(seen - (cx, cy), axis=1).max())
+        return inside, float(np.linalg.norm(positions - (cx, cy), axis=1).max())
 
     # From the narrowest view to wider ones: far from the centre a distortion polynomial is no longer monotonic, and a
     # border there would be mapped back into the photo.
@@ -245,8 +245,8 @@ def distortion(lens: Lens) -> float:
     corner = np.array([[0.0, 0.0], [lens.width, 0.0], [0.0, lens.height], [lens.width, lens.height]])
     frame = np.concatenate([corner, (corner + corner[[1, 3, 0, 2]]) / 2])
     rays = np.stack(without_distortion(camera).normalized(frame[:, 0], frame[:, 1]), axis=1)
-    seen = pixels_of(camera, _ahead(rays))
-    return float(np.linalg.norm(np.where(np.isfinite(seen), seen, NOWHERE) - frame, axis=1).max())
+    pixels = pixels_of(camera, _ahead(rays))
+    return float(np.linalg.norm(np.where(np.isfinite(pixels), pixels, NOWHERE) - frame, axis=1).max())
 
 
 def without_distortion(camera: pycolmap.Camera) -> Camera:

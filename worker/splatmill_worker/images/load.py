@@ -169,12 +169,12 @@ def load_view(
     full = view.camera
     width, height = training_size(full.width, full.height, longest_side)
     camera = full.scaled_to(width, height)
-    seen = None
+    visible = None
     if view.face is not None:
         size = faces.enough(view.face, camera)
         key = view.image, view.mask, view.shown_from, view.upright, size
         whole = divided_photos.of(key, lambda: faces.prepared(_layers(view, size), view.mask is None, size))
-        planes, seen = faces.resampled(whole, view.face, camera)
+        planes, visible = faces.resampled(whole, view.face, camera)
         has_alpha = len(planes) - (view.mask is not None) == 4
     else:
         # Undistortion interpolates a photo of at least twice the size, so that it does not blur.
@@ -187,8 +187,8 @@ def load_view(
     if view.lens is None:
         planes = _area(planes, width, height)
     else:
-        planes, seen = _undistort(planes, view.lens, camera)
-    keep = None if seen is None or bool(seen.all()) else seen
+        planes, visible = _undistort(planes, view.lens, camera)
+    keep = None if visible is None or bool(visible.all()) else visible
     if view.mask is not None:
         keep = planes[-1] >= MIN_COVER if keep is None else keep & (planes[-1] >= MIN_COVER)
     alpha = None

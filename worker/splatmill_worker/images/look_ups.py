@@ -33,7 +33,7 @@ def resampled(
 
     rotation: from the frame of the photo's camera to that of `camera`, [3,3]; None: they are the same.
     """
-    grid, seen = of(lens, camera, samples, rotation)
+    grid, visible = of(lens, camera, samples, rotation)
     taken = torch.nn.functional.grid_sample(
         planes[None],
         grid[None],
@@ -42,7 +42,7 @@ def resampled(
         padding_mode="border",
         align_corners=False,
     )
-    return torch.nn.functional.avg_pool2d(taken, samples)[0].clamp(0.0, 255.0), seen
+    return torch.nn.functional.avg_pool2d(taken, samples)[0].clamp(0.0, 255.0), visible
 
 
 def of(lens: Lens, camera: Camera, samples: int, rotation: Float | None = None) -> LookUp:
@@ -83,15 +83,15 @@ def _size(look_up: LookUp) -> int:
 def _computed(lens: Lens, camera: Camera, samples: int, rotation: Float) -> LookUp:
     width, height = camera.width, camera.height
     grid = np.empty((samples * height, samples * width, 2), np.float32)
-    seen = np.empty((height, width), np.bool_)
+    visible = np.empty((height, width), np.bool_)
     rows = max(1, BAND // (samples * samples * width))
     for top in range(0, height, rows):
         part = slice(top, min(top + rows, height))
         positions = _positions(lens, camera, part, samples, rotation)
         grid[samples * part.start : samples * part.stop] = positions
         inside = np.all(np.abs(positions) <= 1.0 + 1.0 / min(lens.width, lens.height), axis=2)
-        seen[part] = inside.reshape(part.stop - part.start, samples, width, samples).all(axis=(1, 3))
-    return torch.from_numpy(grid), torch.from_numpy(seen)
+        visible[part] = inside.reshape(part.stop - part.start, samples, width, samples).all(axis=(1, 3))
+    return torch.from_numpy(grid), torch.from_numpy(visible)
 
 
 def _positions(lens: Lens, camera: Camera, rows: slice, samples: int, rotation: Float) -> Float:

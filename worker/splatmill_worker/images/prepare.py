@@ -119,7 +119,7 @@ class Prepared:
 
 
 @dataclass
-class _Found:
+class _Inventory:
     """Files found so far.
 
     files: name, path, and name of the video that the file is a frame of.
@@ -162,21 +162,21 @@ def prepare(
     and videos that together exceed `archive.Allowance`, CaptureIncomplete when a file is neither used nor skipped, and
     Cancelled.
     """
-    found = _Found()
-    given = given_files(images)
-    for path in given:
-        _expand(path.relative_to(images).as_posix(), path, None, workdir, frames, found, cancelled)
-    outputs = own_outputs(name for name, _, _ in found.files)
-    found.skipped += [(name, "it is a result of Splatmill, not a photo") for name in sorted(outputs)]
-    found.files = [file for file in found.files if file[0] not in outputs]
-    others = beside_photos(name for name, _, _ in found.files)
-    found.skipped += [(name, f"it lies in a folder of {what}") for name, what in others.items()]
-    found.files = [file for file in found.files if file[0] not in others]
-    beside = {name: path for name, path, _ in found.files}
-    own_masks = _own_masks(found)
+    inventory = _Inventory()
+    paths = given_files(images)
+    for path in paths:
+        _expand(path.relative_to(images).as_posix(), path, None, workdir, frames, inventory, cancelled)
+    outputs = own_outputs(name for name, _, _ in inventory.files)
+    inventory.skipped += [(name, "it is a result of Splatmill, not a photo") for name in sorted(outputs)]
+    inventory.files = [file for file in inventory.files if file[0] not in outputs]
+    others = beside_photos(name for name, _, _ in inventory.files)
+    inventory.skipped += [(name, f"it lies in a folder of {what}") for name, what in others.items()]
+    inventory.files = [file for file in inventory.files if file[0] not in others]
+    beside = {name: path for name, path, _ in inventory.files}
+    own_masks = _own_masks(inventory)
     mask_files = {inner: beside[name] for name, inner in own_masks.items()}
     mask_files |= masks_under(masks) if masks is not None and masks.is_dir() else {}
-    candidates = [file for file in found.files if file[0] not in own_masks]
+    candidates = [file for file in inventory.files if file[0] not in own_masks]
     pairs = paired([name for name, _, _ in candidates], mask_files)
     photos: dict[str, UsablePhoto] = {}
     small: dict[str, SmallPicture] = {}
@@ -187,34 +187,34 @@ def prepare(
                 raise Cancelled("Examining the photos was cancelled.")
             on_progress("images", done, len(candidates), name)
             if isinstance(inspection, str):
-                found.skipped.append((name, inspection))
+                inventory.skipped.append((name, inspection))
                 continue
             result, small[name] = inspection
             try:
-                result = _with_mask(result, mask_files.get(pairs.get(name, "")), found)
+                result = _with_mask(result, mask_files.get(pairs.get(name, "")), inventory)
             except UnusablePicture as error:
                 if error.code != "decoder_ended":
                     raise
-                found.skipped.append((name, f"of its mask: {error.reason}"))
+                inventory.skipped.append((name, f"of its mask: {error.reason}"))
                 continue
             if (same := photos.get(result.sha256)) is not None:
                 # Programs call a copy "a (1).jpg" or "a copy.jpg".
                 result, copy = sorted((same, result), key=lambda photo: (len(photo.name), photo.name))
                 result = replace(result, mask=result.mask or copy.mask)
-                found.skipped.append((copy.name, f"its content is the same as that of {result.name}"))
+                inventory.skipped.append((copy.name, f"its content is the same as that of {result.name}"))
             photos[result.sha256] = result
-    found.notes += [
+    inventory.notes += [
         f"{photo.name} holds several pictures; the first one is used."
         for photo in photos.values()
         if photo.several
     ]
-    if not photos and found.skipped and decoders.forget_ended():
+    if not photos and inventory.skipped and decoders.forget_ended():
         # The cause may lie outside of the photos, such as a lack of memory, which ends processes for any photo.
-        name, reason = found.skipped[0]
+        name, reason = inventory.skipped[0]
         raise UnusablePicture("decoder_ended", name, f"no photo is left; of this one: {reason}")
     ordered = sorted(photos.values(), key=lambda photo: photo.name)
     no_photo.check({photo.name: photo.kind for photo in ordered})
-    ordered = _without_depth(ordered, found)
+    ordered = _without_depth(ordered, inventory)
 
     def compared(done: int) -> None:
         if cancelled():
@@ -224,16 +224,16 @@ def prepare(
 
     originals = copies.copies([small[photo.name] for photo in ordered], compared)
     copied = [(ordered[copy].name, ordered[original].name) for copy, original in originals.items()]
-    ordered = _without_copies(ordered, originals, found)
+    ordered = _without_copies(ordered, originals, inventory)
     known = (
         {photo.name for photo in ordered}
-        | {name for name, _ in found.skipped}
+        | {name for name, _ in inventory.skipped}
         | own_masks.keys()
-        | found.opened
+        | inventory.opened
     )
-    lost = [name for path in given if (name := path.relative_to(images).as_posix()) not in known]
+    lost = [name for path in paths if (name := path.relative_to(images).as_posix()) not in known]
     if lost:
-        raise CaptureIncomplete(f"{images.name}/", lost, len(given))
+        raise CaptureIncomplete(f"{images.name}/", lost, len(paths))
     unused = mask_files.keys() - pairs.values()
     judged = mask_levels.judged({photo.name: photo.mask for photo in ordered}, unused)
     are_panoramas, assumed = panoramas.decided(
@@ -244,14 +244,14 @@ def prepare(
             for each in ordered
         ]
     )
-    found.warnings += assumed
+    inventory.warnings += assumed
     ordered = [
         replace(photo, shown_from=judged.shown_from, is_panorama=is_panorama)
         for photo, is_panorama in zip(ordered, are_panoramas, strict=True)
     ]
-    found.warnings += photo_colors.sentences([photo.colors for photo in ordered])
-    skipped = [name for name, _ in found.skipped]
-    warnings = [*judged.warnings, *unfit(found.unfit_masks), *unread(skipped), *unread_cameras(skipped)]
+    inventory.warnings += photo_colors.sentences([photo.colors for photo in ordered])
+    skipped = [name for name, _ in inventory.skipped]
+    warnings = [*judged.warnings, *unfit(inventory.unfit_masks), *unread(skipped), *unread_cameras(skipped)]
     hidden = overlays.hidden_in(
         [overlays.Candidate(each.name, each.width, each.height, _source(each)) for each in ordered],
         lambda index, size: _picture(ordered[index], small, size),
@@ -267,13 +267,13 @@ def prepare(
         )
         for photo, mask, circle in zip(ordered, hidden.regions, hidden.circles, strict=True)
     ]
-    found.warnings += [*copies.warning(copied), *hidden.warnings]
-    found.warnings += transparency.remarks({photo.name: photo.alpha for photo in ordered})
+    inventory.warnings += [*copies.warning(copied), *hidden.warnings]
+    inventory.warnings += transparency.remarks({photo.name: photo.alpha for photo in ordered})
     return Prepared(
         tuple(ordered),
-        tuple(found.skipped),
-        (*found.notes, *judged.notes),
-        (*found.warnings, *warnings),
+        tuple(inventory.skipped),
+        (*inventory.notes, *judged.notes),
+        (*inventory.warnings, *warnings),
         hidden.shown,
     )
 
@@ -296,22 +296,24 @@ def given_files(images: Path) -> list[Path]:
     ]
 
 
-def _without_copies(photos: list[UsablePhoto], originals: dict[int, int], found: _Found) -> list[UsablePhoto]:
+def _without_copies(
+    photos: list[UsablePhoto], originals: dict[int, int], inventory: _Inventory
+) -> list[UsablePhoto]:
     """The photos without those that `copies` names; an original without a mask gets that of a copy of its shape."""
     kept = dict(enumerate(photos))
     for copy, original in originals.items():
         mask = kept.pop(copy).mask
         if mask is not None and kept[original].mask is None:
-            kept[original] = _with_mask(kept[original], mask, found)
-        found.skipped.append((photos[copy].name, f"it shows the same as {photos[original].name}"))
+            kept[original] = _with_mask(kept[original], mask, inventory)
+        inventory.skipped.append((photos[copy].name, f"it shows the same as {photos[original].name}"))
     return list(kept.values())
 
 
-def _without_depth(photos: list[UsablePhoto], found: _Found) -> list[UsablePhoto]:
+def _without_depth(photos: list[UsablePhoto], inventory: _Inventory) -> list[UsablePhoto]:
     """The photos without pictures of a single channel of 16 bits, where others have colours of 8 bits."""
     kept = [photo for photo in photos if photo.kind != "depth maps"]
     skipped = [photo for photo in photos if photo.kind == "depth maps"]
-    found.skipped += [
+    inventory.skipped += [
         (photo.name, "it has a single channel of 16 bits, as depth maps have, which other photos have not")
         for photo in skipped
     ]
@@ -325,12 +327,12 @@ def _picture(photo: UsablePhoto, small: dict[str, SmallPicture], at_least: tuple
     return decoders.decode(photo.path, at_least=at_least)
 
 
-def _own_masks(found: _Found) -> dict[str, str]:
+def _own_masks(inventory: _Inventory) -> dict[str, str]:
     """The masks among the photos, each with its name without the folder of masks.
 
     Where all pictures lie in such folders, they are photos.
     """
-    pictures = [name for name, _, video in found.files if video is None]
+    pictures = [name for name, _, video in inventory.files if video is None]
     masks = {name: inner for name in pictures if (inner := without_mask_folder(name)) is not None}
     photos = [name for name in pictures if name not in masks]
     if not photos:
@@ -344,10 +346,10 @@ def _expand(
     inside: str | None,
     workdir: Path,
     frames: int,
-    found: _Found,
+    inventory: _Inventory,
     cancelled: Callable[[], bool],
 ) -> None:
-    """Add a file, or the content of a zip or video, to `found`.
+    """Add a file, or the content of a zip or video, to `inventory`.
 
     inside: name of the zip that holds the file, if there is one.
 
@@ -356,16 +358,16 @@ def _expand(
     suffix = path.suffix.lower()
     try:
         if path.is_symlink() or not path.is_file():
-            found.skipped.append((name, "it is a link or a device, not a file"))
+            inventory.skipped.append((name, "it is a link or a device, not a file"))
         elif suffix in ARCHIVE_SUFFIXES and inside is None:
-            folder = unpacked(name, path, workdir, found.allowance, cancelled)
+            folder = unpacked(name, path, workdir, inventory.allowance, cancelled)
             for inner in given_files(folder):
                 inner_name = f"{Path(name).with_suffix('').as_posix()}/{inner.relative_to(folder).as_posix()}"
-                _expand(inner_name, inner, name, workdir, frames, found, cancelled)
-            found.opened.add(name)
-            found.warnings += names_remark(folder)
+                _expand(inner_name, inner, name, workdir, frames, inventory, cancelled)
+            inventory.opened.add(name)
+            inventory.warnings += names_remark(folder)
         elif suffix in ARCHIVE_SUFFIXES:
-            found.skipped.append((name, "a zip inside a zip is not unpacked; give its photos themselves"))
+            inventory.skipped.append((name, "a zip inside a zip is not unpacked; give its photos themselves"))
         elif suffix in VIDEO_SUFFIXES:
             folder = filled_once(
                 workdir / "frames" / f"{_sha256(path)[:24]}_{frames}",
@@ -374,26 +376,26 @@ def _expand(
             pictures = given_files(folder)
             size = _bytes_of(pictures)
             unpacked_room.take(folder.name, size, may_refuse=False)
-            found.allowance.take(name, 0, size)
+            inventory.allowance.take(name, 0, size)
             prefix = Path(name).with_suffix("").as_posix()
-            found.files += [(f"{prefix}_{p.stem.rpartition('_')[2]}.jpg", p, name) for p in pictures]
-            found.opened.add(name)
+            inventory.files += [(f"{prefix}_{p.stem.rpartition('_')[2]}.jpg", p, name) for p in pictures]
+            inventory.opened.add(name)
             taken = counted(len(pictures), "frame was", "frames were")
-            found.notes.append(f"{taken} taken from the video {name}.")
-            found.warnings += [remark.format(name) for remark in decoders.video_remarks(path)]
+            inventory.notes.append(f"{taken} taken from the video {name}.")
+            inventory.warnings += [remark.format(name) for remark in decoders.video_remarks(path)]
         elif (kind := unread_kind(name)) is not None:
             # Pillow would read the small preview in a raw photo.
-            found.skipped.append((name, f"{kind.what} are not read"))
+            inventory.skipped.append((name, f"{kind.what} are not read"))
         else:
-            found.files.append((name, path, None))
+            inventory.files.append((name, path, None))
     except UnusableVideo as error:
-        found.skipped.append((name, error.reason))
+        inventory.skipped.append((name, error.reason))
     except ValueError as error:
-        found.skipped.append((name, str(error)))
+        inventory.skipped.append((name, str(error)))
     except OSError as error:
         if error.errno in MACHINE_ERRORS:
             raise
-        found.skipped.append((name, f"it cannot be read: {plain(error)}"))
+        inventory.skipped.append((name, f"it cannot be read: {plain(error)}"))
 
 
 def unpacked(
@@ -445,41 +447,41 @@ def filled_once(folder: Path, make: Callable[[Path], object]) -> Path:
 def _inspect(name: str, path: Path, sequence: str | None) -> tuple[UsablePhoto, SmallPicture] | str:
     """The photo, also at low resolution, or the reason why the file is left out."""
     try:
-        found = decoders.examine(path, name)
+        picture = decoders.examine(path, name)
         digest = _sha256(path)
     except OSError as error:
         if error.errno in MACHINE_ERRORS:
             raise
         return f"it cannot be read: {error.strerror}"
-    if isinstance(found, str):
-        return found
-    if transparency.is_clear(found.alpha):
+    if isinstance(picture, str):
+        return picture
+    if transparency.is_clear(picture.alpha):
         return transparency.NOTHING
     photo = UsablePhoto(
         name,
         path,
         digest,
-        found.width,
-        found.height,
-        found.exif,
+        picture.width,
+        picture.height,
+        picture.exif,
         sequence=sequence,
-        several=found.several,
-        colors=found.colors,
-        sphere=found.sphere,
-        alpha=found.alpha,
-        kind=found.kind,
+        several=picture.several,
+        colors=picture.colors,
+        sphere=picture.sphere,
+        alpha=picture.alpha,
+        kind=picture.kind,
     )
-    has_tags = found.exif.make is not None or found.exif.model is not None
-    return photo, SmallPicture(name, found.width, found.height, found.small, has_tags)
+    has_tags = picture.exif.make is not None or picture.exif.model is not None
+    return photo, SmallPicture(name, picture.width, picture.height, picture.small, has_tags)
 
 
-def _with_mask(photo: UsablePhoto, mask: Path | None, found: _Found) -> UsablePhoto:
+def _with_mask(photo: UsablePhoto, mask: Path | None, inventory: _Inventory) -> UsablePhoto:
     """The photo with `mask`, or without it when it is unreadable or has another shape."""
     if mask is None:
         return photo
     fault = decoders.mask_fault(mask, (photo.width, photo.height))
     if fault is not None:
-        found.unfit_masks.append((photo.name, fault))
+        inventory.unfit_masks.append((photo.name, fault))
         return photo
     return replace(photo, mask=mask)
 

@@ -53,15 +53,15 @@ def load(folder: Path, capture: Path) -> Prepared:
     document: dict[str, Any] = json.loads((folder / FILE).read_text("utf-8"))
     roots = {CAPTURE: capture, OVERLAYS: folder / OVERLAYS}
 
-    def found(path: str) -> Path:
+    def file_of(path: str) -> Path:
         root, _, name = path.partition("/")
         return roots[root] / name
 
     photos = tuple(
         dataclasses.replace(
             _PHOTO.validate_python(photo),
-            path=found(photo["path"]),
-            mask=None if photo["mask"] is None else found(photo["mask"]),
+            path=file_of(photo["path"]),
+            mask=None if photo["mask"] is None else file_of(photo["mask"]),
         )
         for photo in document["photos"]
     )

@@ -26,11 +26,11 @@ def tensor(
     """
     if not isinstance(value, Tensor):
         raise TypeError(f"{name}: expected a tensor, got {type(value).__name__}")
-    wanted = "[" + ", ".join("*" if n is None else str(n) for n in shape) + "]"
+    sides = "[" + ", ".join("*" if n is None else str(n) for n in shape) + "]"
     if value.dim() != len(shape) or any(
         n is not None and n != m for n, m in zip(shape, value.shape, strict=True)
     ):
-        raise ValueError(f"{name}: expected shape {wanted}, got {list(value.shape)}")
+        raise ValueError(f"{name}: expected shape {sides}, got {list(value.shape)}")
     if dtype is not None and value.dtype != dtype:
         raise TypeError(f"{name}: expected {dtype}, got {value.dtype}")
     if value.device.type != device:

@@ -262,7 +262,7 @@ def _op(backend: Backend, stem: str, function: str | None = None) -> Callable[..
     """Return the function of that stem in the backend's package; raises NotImplementedError where there is none."""
     module = f"{__package__}.{backend}.{stem}"
     try:
-        found = getattr(importlib.import_module(module), function or stem)
+        op = getattr(importlib.import_module(module), function or stem)
     except ModuleNotFoundError as error:
         if error.name == "triton":
             from .gpu.device import GpuUnavailable, absence
@@ -273,7 +273,7 @@ def _op(backend: Backend, stem: str, function: str | None = None) -> Callable[..
                 f"The {backend} backend has no op '{stem}'; use backend='reference', which has all."
             ) from None
         raise
-    return cast(Callable[..., Any], found)
+    return cast(Callable[..., Any], op)
 
 
 def _kind(backend: Backend, like: object) -> dict[str, Any]:

@@ -51,7 +51,7 @@ class NoSurface(Exception):
 
 
 @dataclass(frozen=True)
-class Wanted:
+class MeshSettings:
     """What mesh is asked for.
 
     faces: most triangles.
@@ -87,7 +87,7 @@ class Built:
 def build(
     gaussians: Gaussians,
     cameras: Sequence[Camera],
-    wanted: Wanted,
+    request: MeshSettings,
     *,
     antialias: bool = False,
     backend: ops.Backend | None = None,
@@ -116,22 +116,22 @@ def build(
     if not len(depths):
         raise NoSurface
     middle = float(depths.median())
-    voxel = wanted.voxel or FOOTPRINT * middle / _focal(views)
-    samples = samples_of(views, Region(REACH * middle, _around(wanted.box)))
+    voxel = request.voxel or FOOTPRINT * middle / _focal(views)
+    samples = samples_of(views, Region(REACH * middle, _around(request.box)))
     if len(samples.points) < LEAST:
         raise NoSurface
-    depth = levels(samples, voxel, exact=wanted.voxel is not None)
+    depth = levels(samples, voxel, exact=request.voxel is not None)
     told(Progress(stage="laying a surface through the depths"))
-    whole = without_specks(_within(reconstruct(samples, depth), wanted.box), SPECK)
+    whole = without_specks(_within(reconstruct(samples, depth), request.box), SPECK)
     if not len(whole.faces):
         raise NoSurface
     told(Progress(stage="simplifying the surface"))
-    mesh = simplified(whole, wanted.faces)
+    mesh = simplified(whole, request.faces)
     told(Progress(stage="colouring the surface"))
     mesh = colored(mesh, views)
-    if wanted.texture is not None:
+    if request.texture is not None:
         told(Progress(stage="painting a texture"))
-        mesh = textured(mesh, views, wanted.texture)
+        mesh = textured(mesh, views, request.texture)
     return Built(mesh, len(views), middle, side_of(samples, depth), len(whole.faces))
 
 

@@ -38,13 +38,13 @@ def blended(points: Tensor, normals: Tensor, views: Sequence[View]) -> tuple[Ten
     for view in views:
         column, row, z = view.pixels(points)
         agrees = (z > 0) & ((view.depth[row, column] - z).abs() < AGREEMENT * z)
-        seen = agrees.nonzero()[:, 0]
+        visible = agrees.nonzero()[:, 0]
         center = torch.as_tensor(view.camera.center).float()
-        towards = torch.nn.functional.normalize(center - points[seen], dim=1)
-        facing = (towards * normals[seen]).sum(1).clamp_min(0.0) ** SHARPEST
-        share = facing / z[seen].square().clamp_min(1e-12)
-        total[seen] += share[:, None] * view.color[row[seen], column[seen]].float()
-        weight[seen] += share
+        towards = torch.nn.functional.normalize(center - points[visible], dim=1)
+        facing = (towards * normals[visible]).sum(1).clamp_min(0.0) ** SHARPEST
+        share = facing / z[visible].square().clamp_min(1e-12)
+        total[visible] += share[:, None] * view.color[row[visible], column[visible]].float()
+        weight[visible] += share
     return total / weight[:, None].clamp_min(1e-30), weight
 
 

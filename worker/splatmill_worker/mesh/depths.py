@@ -84,15 +84,17 @@ def views_of(
     """What each of the cameras sees of the model, without surfaces that it only grazes. `told` hears of each view."""
     views = []
     for index, camera in enumerate(cameras):
-        seen = surface(gaussians, camera, transmittance=TRANSMITTANCE, antialias=antialias, backend=backend)
-        depth, normal = seen.depth.cpu(), seen.normal.cpu()
+        rendering = surface(
+            gaussians, camera, transmittance=TRANSMITTANCE, antialias=antialias, backend=backend
+        )
+        depth, normal = rendering.depth.cpu(), rendering.normal.cpu()
         columns, rows = torch.arange(camera.width) + 0.5, torch.arange(camera.height) + 0.5
         x, y = camera.normalized(columns, rows)
         rays = torch.stack([*torch.meshgrid(x, y, indexing="xy"), torch.ones_like(depth)], -1)
         viewmat, _ = camera_tensors(camera, depth)
         towards = -torch.nn.functional.normalize(rays, dim=-1) @ viewmat[:3, :3]
         facing = (towards * normal).sum(-1) > GRAZING
-        color = (seen.color.cpu().clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
+        color = (rendering.color.cpu().clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
         views.append(View(camera, color, torch.where(facing, depth, 0.0)))
         told(index + 1)
     return views

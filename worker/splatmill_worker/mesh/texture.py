@@ -50,8 +50,8 @@ def textured(mesh: Mesh, views: Sequence[View], side: int) -> Mesh:
         where, direction, color = (
             np.einsum("nk,nkc->nc", shares, values[at]) for values in (points, normals, known)
         )
-        seen, weight = blended(torch.from_numpy(where), torch.from_numpy(direction), views)
-        picture[texels] = np.where(weight.numpy()[:, None] > 0, seen.numpy(), color)
+        blend, weight = blended(torch.from_numpy(where), torch.from_numpy(direction), views)
+        picture[texels] = np.where(weight.numpy()[:, None] > 0, blend.numpy(), color)
         covered[texels] = True
     picture = _padded(picture.reshape(height, width, 3), covered.reshape(height, width))
     return replace(

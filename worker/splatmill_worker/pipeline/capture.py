@@ -29,17 +29,17 @@ CAMERAS_SHARE = 0.5
 
 
 @dataclass(frozen=True)
-class _Found:
+class _Contents:
     """What a capture holds.
 
     capture: folder with images/, or with photos; that of the unpacked data set where the capture is a zip of one.
     points: file of points to start from.
-    given: the cameras that it brings; None where they are to be recovered.
+    cameras: the cameras that it brings; None where they are to be recovered.
     """
 
     capture: Path
     points: Path | None
-    given: posed.PosedInput | None
+    cameras: posed.PosedInput | None
 
     @property
     def photos(self) -> Path:
@@ -59,12 +59,12 @@ def photos_without_cameras(
 
     Raises Refusal, as `posed_scene` does, and what `prepare` raises.
     """
-    found = _found(capture, workdir, options, on_progress, cancelled)
-    if found.given is not None:
+    contents = _contents(capture, workdir, options, on_progress, cancelled)
+    if contents.cameras is not None:
         return None
     return prepare(
-        found.photos,
-        mask_folder(found.capture),
+        contents.photos,
+        mask_folder(contents.capture),
         workdir,
         frames=options.max_video_frames,
         on_progress=on_progress,
@@ -107,9 +107,9 @@ def posed_scene(
 
     Raises Refusal for poses and points that cannot be used and for a scale that cannot be followed, and SfmFailed.
     """
-    found = _found(capture, workdir, options, on_progress, cancelled)
-    capture, points, given = found.capture, found.points, found.given
-    if given is not None:
+    contents = _contents(capture, workdir, options, on_progress, cancelled)
+    capture, points, cameras = contents.capture, contents.points, contents.cameras
+    if cameras is not None:
         if options.scale is not None:
             raise Refusal(
                 "option_out_of_range",
@@ -117,7 +117,7 @@ def posed_scene(
                 advice="Leave out the option scale, or scale the given cameras.",
             )
         try:
-            scene = faces.cut(overlays.in_views(given.load(), workdir))
+            scene = faces.cut(overlays.in_views(cameras.load(), workdir))
         except posed.UnreadModel as error:
             raise Refusal("poses_invalid", str(error), advice=error.advice) from error
         except (ValueError, OSError) as error:
@@ -140,7 +140,7 @@ def posed_scene(
             scene = given_points.with_given_points(scene, points, options, on_progress, cancelled)
         return replace(scene, warnings=(*scene.warnings, *one_place.warning(scene)))
     scene = sfm.reconstruct(
-        found.photos,
+        contents.photos,
         mask_folder(capture),
         workdir,
         sfm_options(options),
@@ -158,21 +158,21 @@ def posed_scene(
     )
 
 
-def _found(
+def _contents(
     capture: Path,
     workdir: Path,
     options: TrainOptions,
     on_progress: OnProgress,
     cancelled: Callable[[], bool],
-) -> _Found:
+) -> _Contents:
     """What the capture holds. Raises Refusal where it has the cameras of two data sets."""
     capture = example.photographed_capture(capture, workdir, on_progress, cancelled)
     points = given_points.points_path(capture, options)
     capture = zipped.data_set(capture, workdir, cancelled)
     try:
-        given = posed.find(capture) or zipped.cameras_beside(capture, workdir, cancelled)
+        cameras = posed.find(capture) or zipped.cameras_beside(capture, workdir, cancelled)
     except (TwoDataSets, posed.TwoFiles) as error:
         raise Refusal(
             "poses_invalid", str(error), advice="Give one data set, or photos without cameras."
         ) from error
-    return _Found(capture, points, given)
+    return _Contents(capture, points, cameras)

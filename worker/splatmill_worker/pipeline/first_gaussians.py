@@ -41,13 +41,13 @@ def first_gaussians(job: Job, cameras: Cameras, photos: Photos) -> First:
     """The given model, or Gaussians made from points and in the visual hull of transparent photos, or at random."""
     path = start_model_path(job.capture, job.workdir, job.options)
     if path is not None:
-        given = read_given_model(path, cameras.normalization, _most_given(job.options))
-        gaussians = given.gaussians
-        for note in given.notes:
+        model = read_given_model(path, cameras.normalization, _most_given(job.options))
+        gaussians = model.gaussians
+        for note in model.notes:
             job.warn(f"{path.name}: {note}")
-        if given.count > gaussians.count:
-            job.warn(_reduced_message(path, given.count, gaussians.count))
-        start = assess(gaussians, photos.training, antialiased=given.antialiased)
+        if model.count > gaussians.count:
+            job.warn(_reduced_message(path, model.count, gaussians.count))
+        start = assess(gaussians, photos.training, antialiased=model.antialiased)
         if start.doubtful:
             job.warn(_doubt_message(start))
         return First(gaussians, start)

@@ -124,7 +124,7 @@ def aligned(
     """
     if (colors == colors[0]).all():
         return _none("They have no colours, by which they could be aligned to the points of the photos.")
-    found = align(
+    alignment = align(
         points,
         colors,
         scene.points,
@@ -133,23 +133,26 @@ def aligned(
         on_progress=on_progress,
         cancelled=cancelled,
     )
-    if isinstance(found, Unaligned):
-        return _none(f"They could not be aligned to the points of the photos: {found.reason}.")
+    if isinstance(alignment, Unaligned):
+        return _none(f"They could not be aligned to the points of the photos: {alignment.reason}.")
     views = [view for view in scene.views if view.split != "test"]
-    moved = found.similarity.points(points)
+    moved = alignment.similarity.points(points)
     rows, pixels = posed.resolved(moved, posed.footprints(moved, views, side, cancelled), most(views, side))
     how = Alignment(
-        round(found.share, 4), found.residual, found.similarity.scale, found.similarity.matrix.tolist()
+        round(alignment.share, 4),
+        alignment.residual,
+        alignment.similarity.scale,
+        alignment.similarity.matrix.tolist(),
     )
     said = (
-        f"Aligned as well as they can be, {100 * found.share:.0f} % of the points of the photos lie on them, half of "
-        f"these within {found.residual:.3g} of the file's units."
+        f"Aligned as well as they can be, {100 * alignment.share:.0f} % of the points of the photos lie on them, half "
+        f"of these within {alignment.residual:.3g} of the file's units."
     )
     if len(rows) < LEAST_SHOWN:
         return _none(f"{said} The photos show {len(rows)} of them apart from each other.", how)
     moved, own = moved[rows], colors[rows]
-    kept, seen = _shown(scene, moved, own, cancelled)
-    return Fit(moved[kept], own[kept], len(rows), pixels, f"{said} {seen}", how)
+    kept, sentence = _shown(scene, moved, own, cancelled)
+    return Fit(moved[kept], own[kept], len(rows), pixels, f"{said} {sentence}", how)
 
 
 def _none(sentence: str, alignment: Alignment | None = None) -> Fit:
@@ -225,9 +228,9 @@ def point_views(scene: Scene, points: Float) -> PointViews:
     rows, views = [np.zeros(0, np.intp)], [np.zeros(0, np.int32)]
     for index, view in enumerate(scene.views):
         if view.split != "test":
-            seen = posed.visible(view.camera, view.camera.project(points))
-            rows.append(seen)
-            views.append(np.full(len(seen), index, np.int32))
+            visible = posed.visible(view.camera, view.camera.project(points))
+            rows.append(visible)
+            views.append(np.full(len(visible), index, np.int32))
     of_point = np.concatenate(rows)
     order = np.argsort(of_point, kind="stable")
     offsets = np.concatenate([[0], np.cumsum(np.bincount(of_point, minlength=len(points)))]).astype(np.int64)

@@ -40,7 +40,7 @@ DEFAULT_SIDE = 960
 
 
 @dataclass(frozen=True)
-class Wanted:
+class CleanSettings:
     """What to clean by; None: not by that.
 
     capture: folder of the photos, with their cameras or for the cameras.zip beside the model.
@@ -92,14 +92,14 @@ class _Views:
 def run(chosen: argparse.Namespace) -> int:
     """Run `clean-file` with its parsed arguments; returns the exit status."""
     edit = None if chosen.edit is None else EditModel.model_validate_json(chosen.edit)
-    wanted = Wanted(chosen.capture, edit, chosen.min_weight, chosen.image_size)
-    return main(chosen.model, chosen.out, wanted)
+    request = CleanSettings(chosen.capture, edit, chosen.min_weight, chosen.image_size)
+    return main(chosen.model, chosen.out, request)
 
 
-def main(model: Path, out: Path, wanted: Wanted) -> int:
+def main(model: Path, out: Path, request: CleanSettings) -> int:
     """Clean a file, print what was removed, and return the exit status."""
     try:
-        cleaned = clean_file(model, out, wanted)
+        cleaned = clean_file(model, out, request)
     except (ModelUnreadable, Refusal) as error:
         print(f"Error: {error.message}", file=sys.stderr)
         return REFUSED
@@ -114,7 +114,7 @@ def main(model: Path, out: Path, wanted: Wanted) -> int:
     return 0
 
 
-def clean_file(model: Path, out: Path, wanted: Wanted) -> Cleaned:
+def clean_file(model: Path, out: Path, request: CleanSettings) -> Cleaned:
     """Write what cleaning leaves of the model in `model` to `out`, whose suffix names the format.
 
     Photos that cameras.json beside the model names as held out decide nothing; without a cameras.json, they are chosen
@@ -126,14 +126,14 @@ def clean_file(model: Path, out: Path, wanted: Wanted) -> Cleaned:
     whole, antialias = contents.gaussians, bool(contents.antialiased)
     cleaned = Cleaned(whole.count, whole.count)
     keep = torch.ones(whole.count, dtype=torch.bool)
-    if wanted.edit is not None:
-        keep = kept(whole, wanted.edit)
+    if request.edit is not None:
+        keep = kept(whole, request.edit)
         cleaned.removed["outside the box"] = int((~keep).sum())
-    if (wanted.min_weight is not None or wanted.capture is not None) and bool(keep.any()):
-        views = _views(model, wanted, contents.offset)
+    if (request.min_weight is not None or request.capture is not None) and bool(keep.any()):
+        views = _views(model, request, contents.offset)
         shift = views.frame.scale * torch.tensor(views.offset, dtype=torch.float64)
         shift += torch.from_numpy(views.frame.translation)
-        keep = _by_photos(whole.moved(views.frame.scale, shift), keep, views, wanted, antialias, cleaned)
+        keep = _by_photos(whole.moved(views.frame.scale, shift), keep, views, request, antialias, cleaned)
     if not bool(keep.any()):
         raise Refusal(
             "option_out_of_range",
@@ -174,7 +174,7 @@ def _by_photos(
     gaussians: Gaussians,
     keep: Tensor,
     views: _Views,
-    wanted: Wanted,
+    request: CleanSettings,
     antialias: bool,
     cleaned: Cleaned,
 ) -> Tensor:
@@ -184,19 +184,19 @@ def _by_photos(
     if views.photos:
         _check_world(gaussians.select(keep), views.training, antialias)
     before = [_mean(gaussians, each, background, antialias) for each in (views.training, views.held_out)]
-    if wanted.min_weight is not None:
+    if request.min_weight is not None:
         rows = keep.nonzero()[:, 0]
         weights = evidence_of(gaussians.select(rows), targets, background, antialias=antialias).peak
-        light = rows[weights < wanted.min_weight]
+        light = rows[weights < request.min_weight]
         keep[light] = False
-        cleaned.removed[f"weight below {wanted.min_weight:g}"] = len(light)
+        cleaned.removed[f"weight below {request.min_weight:g}"] = len(light)
     if not views.photos:
         return keep
-    if wanted.capture is not None and bool(keep.any()):
+    if request.capture is not None and bool(keep.any()):
         rows = keep.nonzero()[:, 0]
-        found = clean(gaussians.select(rows), targets, background, antialias=antialias)
-        keep[rows[~found.keep]] = False
-        cleaned.removed |= {f"unsupported: {kind}": count for kind, count in found.removed.items()}
+        cleaning = clean(gaussians.select(rows), targets, background, antialias=antialias)
+        keep[rows[~cleaning.keep]] = False
+        cleaned.removed |= {f"unsupported: {kind}": count for kind, count in cleaning.removed.items()}
     left = gaussians.select(keep)
     after = [_mean(left, each, background, antialias) for each in (views.training, views.held_out)]
     cleaned.photos = (len(views.training), before[0], after[0])
@@ -222,10 +222,10 @@ def _check_world(gaussians: Gaussians, views: Sequence[TrainingView], antialias:
         ) from error
 
 
-def _views(model: Path, wanted: Wanted, offset: tuple[float, float, float]) -> _Views:
+def _views(model: Path, request: CleanSettings, offset: tuple[float, float, float]) -> _Views:
     """The photos in the capture, or the cameras in the cameras.json beside the model where there is no capture."""
     stored = _stored(model)
-    if wanted.capture is None:
+    if request.capture is None:
         if stored is None:
             raise Refusal(
                 "poses_invalid",
@@ -234,9 +234,9 @@ def _views(model: Path, wanted: Wanted, offset: tuple[float, float, float]) -> _
             )
         return _cameras_alone(stored)
     with ExitStack() as stack:
-        scene, own = _scene(wanted.capture, model, stack)
+        scene, own = _scene(request.capture, model, stack)
         training, held_out = _split(scene, stored)
-        side = wanted.image_size or (DEFAULT_SIDE if stored is None else _longest(stored))
+        side = request.image_size or (DEFAULT_SIDE if stored is None else _longest(stored))
         frame = Normalization.of(scene)
         shown, set_aside = (
             [TrainingView.of(photo, frame) for photo in load_views(views, side)]
@@ -248,11 +248,11 @@ def _views(model: Path, wanted: Wanted, offset: tuple[float, float, float]) -> _
 def _scene(capture: Path, model: Path, stack: ExitStack) -> tuple[Scene, bool]:
     """The posed scene of a capture, and whether its cameras are those of the model, in the world of its file."""
     try:
-        given, own = posed.find(capture), False
+        cameras, own = posed.find(capture), False
     except (TwoDataSets, posed.TwoFiles) as error:
         raise Refusal("poses_invalid", str(error)) from error
     beside = model.with_name("cameras.zip")
-    if given is None and beside.is_file():
+    if cameras is None and beside.is_file():
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="splatmill-clean-")))
         images = capture / "images"
         (folder / "images").symlink_to((images if images.is_dir() else capture).resolve())
@@ -260,15 +260,15 @@ def _scene(capture: Path, model: Path, stack: ExitStack) -> tuple[Scene, bool]:
             unpack(beside, folder / "poses")
         except UnsafeArchive as error:
             raise Refusal("poses_invalid", f"{beside} is damaged: {error}.") from error
-        given, own = posed.find(folder), True
-    if given is None:
+        cameras, own = posed.find(folder), True
+    if cameras is None:
         raise Refusal(
             "poses_invalid",
             f"{capture} has no cameras (a COLMAP model, transforms.json or a Blender data set), and there is no "
             f"cameras.zip beside {model.name}.",
         )
     try:
-        return given.load(), own
+        return cameras.load(), own
     except ValueError as error:
         raise Refusal("poses_invalid", str(error)) from error
 

@@ -57,11 +57,11 @@ def serve(host: str, port: int, uds: Path | None, fd: int | None = None, backend
 
 def _cache_bytes() -> int:
     """Bytes of memory for cached models. Raises ValueError where SPLATMILL_RENDER_CACHE is not a size."""
-    given = os.environ.get("SPLATMILL_RENDER_CACHE")
-    if not given:
+    text = os.environ.get("SPLATMILL_RENDER_CACHE")
+    if not text:
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
         return min(MAX_CACHE_BYTES, memory // 8)
     try:
-        return int(parse_bytes(given))
+        return int(parse_bytes(text))
     except (ValueError, OverflowError) as error:
         raise ValueError(f"SPLATMILL_RENDER_CACHE cannot be used: {error}.") from error

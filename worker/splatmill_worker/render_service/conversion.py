@@ -99,12 +99,12 @@ def score(
 
     shown = _rendered(model, back, view, background)
     if view.photo is None:
-        wanted = (_rendered(model, model.gaussians, view, background).clamp(0, 1) * 255).round().byte()
-        found = compare(view.name, shown, wanted)
-        return PictureScore(found.psnr, found.ssim, None)
+        original = (_rendered(model, model.gaussians, view, background).clamp(0, 1) * 255).round().byte()
+        comparison = compare(view.name, shown, original)
+        return PictureScore(comparison.psnr, comparison.ssim, None)
     photo, mask = _photo(storage, model.id, view.photo)
-    found = compare(view.name, shown, photo, mask)
-    return PictureScore(found.psnr, found.ssim, view.psnr)
+    comparison = compare(view.name, shown, photo, mask)
+    return PictureScore(comparison.psnr, comparison.ssim, view.psnr)
 
 
 def with_scores(record: Conversion, scores: Sequence[PictureScore], what: ComparedWith | None) -> Conversion:

@@ -73,7 +73,7 @@ def convert(model: Path, outs: Sequence[Path], photos: Path | None) -> tuple[int
     contents = read(model)
     gaussians, antialias = contents.gaussians, bool(contents.antialiased)
     viewpoints, how = _viewpoints(model, gaussians, photos)
-    seen, notes = look(gaussians, viewpoints, antialias=antialias)
+    originals, notes = look(gaussians, viewpoints, antialias=antialias)
     converted = []
     for out in outs:
         count = registry.write(
@@ -85,9 +85,9 @@ def convert(model: Path, outs: Sequence[Path], photos: Path | None) -> tuple[int
             to_earth=place_beside(model),
         )
         lost = None
-        found = format_of(out.name)
-        if found is not None and found.readable:
-            lost = loss(registry.read(out).gaussians, seen, antialias=antialias)
+        model_format = format_of(out.name)
+        if model_format is not None and model_format.readable:
+            lost = loss(registry.read(out).gaussians, originals, antialias=antialias)
         else:
             notes.append(f"What {out.name} lost is not known: the format is not read.")
         converted.append(Converted(out, count, lost))

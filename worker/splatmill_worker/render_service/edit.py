@@ -118,10 +118,10 @@ def _score(
     scores = []
     for name, camera, photo, mask in photos:
         with torch.no_grad():
-            seen = render(
+            picture = render(
                 gaussians, camera, background=background, antialias=antialias, backend=cast(Any, backend)
             )
-        scores.append(compare(name, seen.color.cpu(), photo, mask))
+        scores.append(compare(name, picture.color.cpu(), photo, mask))
     return Score(tuple(scores))
 
 

@@ -81,8 +81,8 @@ def _surface(model: LoadedModel, camera: Camera) -> tuple[npt.NDArray[np.float32
     """Return median depth [H, W] and normals [H, W, 3] as float32 arrays."""
     from splatmill_worker.splat.surface import surface
 
-    seen = surface(model.seen_by(camera), camera, antialias=model.antialias, backend=cast(Any, model.backend))
-    return seen.depth.cpu().numpy(), seen.normal.cpu().numpy()
+    view = surface(model.seen_by(camera), camera, antialias=model.antialias, backend=cast(Any, model.backend))
+    return view.depth.cpu().numpy(), view.normal.cpu().numpy()
 
 
 def _encode_color(arrays: dict[str, Any], request: RenderRequest) -> EncodedImage:

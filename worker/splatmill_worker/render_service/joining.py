@@ -25,16 +25,16 @@ def join(parts: Sequence[Path], path: Path) -> int:
         stream: Any = None
         for part in parts:
             with guarded.opened_video(part) as (source, opened):
-                found: Any = opened
+                track: Any = opened
                 if stream is None:
-                    stream = target.add_stream_from_template(found)
-                elif found.codec_context.extradata != stream.codec_context.extradata:
+                    stream = target.add_stream_from_template(track)
+                elif track.codec_context.extradata != stream.codec_context.extradata:
                     raise ValueError(
                         f"the part {part.name} was encoded with other settings than those before it"
                     )
                 # The duration of a frame in units of the time base.
-                frame = int(1 / (found.average_rate * found.time_base))
-                for packet in source.demux(found):
+                frame = int(1 / (track.average_rate * track.time_base))
+                for packet in source.demux(track):
                     if packet.dts is None:  # the end of the part
                         continue
                     packet.pts += frames * frame
@@ -43,5 +43,5 @@ def join(parts: Sequence[Path], path: Path) -> int:
                     packet.stream = stream
                     target.mux(packet)
                     written += 1
-                frames += found.frames
+                frames += track.frames
     return frames

@@ -129,9 +129,9 @@ class LeveledModel:
 def opened(path: Path) -> Iterator[LeveledModel | None]:
     """A model in levels of detail. None for a file of another format, and for one of which views cannot choose levels,
     such as one that does not state their errors: it may still be read whole, or the reader says what it lacks."""
-    found = format_of(path.name)
+    model_format = format_of(path.name)
     source = {"lod-meta.json": streamed_sog.opened, ".lod.zip": streamed_zip.opened}.get(
-        "" if found is None else found.suffix
+        "" if model_format is None else model_format.suffix
     )
     with ExitStack() as stack:
         # A pipe would keep its reader waiting.
@@ -161,13 +161,13 @@ def leaves_of(index: Any) -> tuple[Leaves, Places]:
     levels = index["lodLevels"]
     if type(levels) is not int or not 0 < levels <= MOST_LEVELS:
         raise ValueError(f"it has {levels!r:.20} levels")
-    found = []
+    rows = []
     for node in streamed_sog.leaves(index):
         lods = [node["lods"][str(level)] for level in range(levels)]
         places = [(lod["file"], lod["offset"], lod["count"]) for lod in lods]
-        found.append((node["bound"]["min"], node["bound"]["max"], node["errors"], places))
-    low, high, errors, runs = (np.array(column) for column in zip(*found, strict=True))
-    shapes = [(len(found), 3), (len(found), 3), (len(found), levels), (len(found), levels, 3)]
+        rows.append((node["bound"]["min"], node["bound"]["max"], node["errors"], places))
+    low, high, errors, runs = (np.array(column) for column in zip(*rows, strict=True))
+    shapes = [(len(rows), 3), (len(rows), 3), (len(rows), levels), (len(rows), levels, 3)]
     if [column.shape for column in (low, high, errors, runs)] != shapes or runs.dtype != np.int64:
         raise ValueError("a leaf of its tree has a box, errors or levels of another length")
     leaves = Leaves(low.astype(float), high.astype(float), errors.astype(float), runs[..., 2])

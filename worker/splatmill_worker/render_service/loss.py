@@ -41,7 +41,7 @@ class Viewpoint:
 
 
 @dataclass(frozen=True)
-class Seen:
+class RenderedView:
     """A view of the model before the conversion.
 
     camera: of the view.
@@ -73,28 +73,28 @@ class Loss:
 
 def look(
     gaussians: Gaussians, viewpoints: Sequence[Viewpoint], *, antialias: bool
-) -> tuple[list[Seen], list[str]]:
+) -> tuple[list[RenderedView], list[str]]:
     """Render the views of a model before its conversion; returns them, and a sentence for each photo that is not used.
 
     The background is black, or white where the model is as near to its photo as it was only over white.
     """
-    seen, notes = [], []
+    originals, notes = [], []
     for viewpoint in viewpoints:
-        black = Seen(viewpoint.camera, 0.0, _colors(gaussians, viewpoint.camera, 0.0, antialias))
-        found = black
+        black = RenderedView(viewpoint.camera, 0.0, _colors(gaussians, viewpoint.camera, 0.0, antialias))
+        view = black
         if viewpoint.photo is not None:
             try:
-                found = _with_photo(gaussians, viewpoint, black, antialias)
+                view = _with_photo(gaussians, viewpoint, black, antialias)
             except (OSError, ValueError, UnusablePicture) as error:
                 notes.append(f"{viewpoint.name} is not compared with: {error}")
-        seen.append(found)
-    return seen, notes
+        originals.append(view)
+    return originals, notes
 
 
-def loss(gaussians: Gaussians, seen: Sequence[Seen], *, antialias: bool) -> Loss:
-    """Compare the views of a converted model with those `seen` before, at least one, and with the photos."""
+def loss(gaussians: Gaussians, originals: Sequence[RenderedView], *, antialias: bool) -> Loss:
+    """Compare the views of a converted model with the `originals` before, at least one, and with the photos."""
     views, before, after = [], [], []
-    for view in seen:
+    for view in originals:
         color = _colors(gaussians, view.camera, view.background, antialias)
         views.append(_psnr(color, view.before, None))
         if view.photo is not None:
@@ -103,12 +103,14 @@ def loss(gaussians: Gaussians, seen: Sequence[Seen], *, antialias: bool) -> Loss
     return Loss(_mean(views), _mean(before) if before else None, _mean(after) if after else None)
 
 
-def _with_photo(gaussians: Gaussians, viewpoint: Viewpoint, black: Seen, antialias: bool) -> Seen:
+def _with_photo(
+    gaussians: Gaussians, viewpoint: Viewpoint, black: RenderedView, antialias: bool
+) -> RenderedView:
     """The view with its photo. Raises ValueError where the photo is not what the model was compared with before."""
     assert viewpoint.photo is not None
     camera = viewpoint.camera
     view = View(viewpoint.name, camera, viewpoint.photo)
-    found = math.nan
+    psnr = math.nan
     for background in (0.0, 1.0):
         before = black.before if not background else _colors(gaussians, camera, background, antialias)
         behind = None if viewpoint.counted else (background,) * 3
@@ -116,11 +118,11 @@ def _with_photo(gaussians: Gaussians, viewpoint: Viewpoint, black: Seen, antiali
         photo = torch.from_numpy(loaded.rgb).float() / 255.0
         transparent = loaded.alpha is not None and viewpoint.counted
         mask = torch.from_numpy(loaded.alpha >= 128) if transparent and loaded.alpha is not None else None
-        found = _psnr(before, photo, mask)
-        if viewpoint.psnr is None or abs(found - viewpoint.psnr) <= SAME_PHOTO:
-            return Seen(camera, background, before, photo, mask)
+        psnr = _psnr(before, photo, mask)
+        if viewpoint.psnr is None or abs(psnr - viewpoint.psnr) <= SAME_PHOTO:
+            return RenderedView(camera, background, before, photo, mask)
     raise ValueError(
-        f"the model has {found:.2f} dB on it, and had {viewpoint.psnr:.2f} dB on what it was trained on. The photo has "
+        f"the model has {psnr:.2f} dB on it, and had {viewpoint.psnr:.2f} dB on what it was trained on. The photo has "
         "lens distortion or a mask, or was changed."
     )
 

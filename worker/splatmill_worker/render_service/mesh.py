@@ -21,7 +21,7 @@ from splatmill.schema import Box, MeshFacts, ModelCameras, OrbitRequest, Progres
 from splatmill_worker.errors import ModelUnreadable, Refusal
 from splatmill_worker.kernels import ops
 from splatmill_worker.mesh import glb, ply
-from splatmill_worker.mesh.build import Built, NoSurface, Told, Wanted, build
+from splatmill_worker.mesh.build import Built, MeshSettings, NoSurface, Told, build
 from splatmill_worker.mesh.poisson import TooFine
 from splatmill_worker.mesh.triangles import Mesh
 from splatmill_worker.render_service.encoding import camera_of
@@ -51,9 +51,11 @@ def main(chosen: argparse.Namespace) -> int:
         _serve(chosen.parent)
     told = _sent if chosen.parent is not None else _Lines().told
     box = None if chosen.box is None else Box.model_validate_json(chosen.box)
-    wanted = Wanted(chosen.faces, chosen.voxel, None if box is None else (box.min, box.max), chosen.texture)
+    request = MeshSettings(
+        chosen.faces, chosen.voxel, None if box is None else (box.min, box.max), chosen.texture
+    )
     try:
-        built = mesh_file(chosen.model, chosen.out, wanted, chosen.cameras, chosen.up, chosen.backend, told)
+        built = mesh_file(chosen.model, chosen.out, request, chosen.cameras, chosen.up, chosen.backend, told)
     except (ModelUnreadable, Refusal) as error:
         if chosen.parent is not None:
             print(MeshLine(problem=error.problem()).encoded().decode(), end="", flush=True)
@@ -81,7 +83,7 @@ def main(chosen: argparse.Namespace) -> int:
 def mesh_file(
     model: Path,
     out: Path,
-    wanted: Wanted,
+    request: MeshSettings,
     cameras: Path | None,
     up: str,
     backend: ops.Backend | None,
@@ -103,7 +105,7 @@ def mesh_file(
     every = cameras_for(stored, gaussians, AXES[up])
     try:
         built = build(
-            gaussians, every, wanted, antialias=bool(contents.antialiased), backend=backend, told=told
+            gaussians, every, request, antialias=bool(contents.antialiased), backend=backend, told=told
         )
     except NoSurface as error:
         raise Refusal(

@@ -44,8 +44,8 @@ def within(means: npt.NDArray[np.float32], stroke: Stroke) -> npt.NDArray[np.int
     near = near[np.argsort(v[near])]
     u, v = u[near], v[near]
     inside = _inside(u, v, line) if stroke.radius is None else _brushed(u, v, line, stroke.radius)
-    found: npt.NDArray[np.intp] = ahead[near[inside]]
-    return found
+    indices: npt.NDArray[np.intp] = ahead[near[inside]]
+    return indices
 
 
 def _bounds(values: Floats, radius: float) -> tuple[float, float]:

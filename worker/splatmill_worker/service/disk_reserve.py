@@ -30,11 +30,11 @@ def spare_bytes() -> int:
 
 def shortage_text() -> str | None:
     """Return why a worker takes no job, or None if it may."""
-    found = shortage()
-    if found is None:
+    short = shortage()
+    if short is None:
         return None
     return (
-        f"{format_bytes(found.free)} are free on the disk of {found.folder}, and {format_bytes(found.reserve)} are "
+        f"{format_bytes(short.free)} are free on the disk of {short.folder}, and {format_bytes(short.reserve)} are "
         "reserved (SPLATMILL_DISK_RESERVE)"
     )
 

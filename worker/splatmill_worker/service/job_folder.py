@@ -100,12 +100,12 @@ class JobFolder:
             raise CaptureIncomplete(self.capture_id, missing, len(entries))
         return len(entries)
 
-    def check_space(self, wanted: Mapping[Path, Entry]) -> None:
+    def check_space(self, files: Mapping[Path, Entry]) -> None:
         """Raise DiskReserveReached if copies of the files that are missing would not fit beside the reserve."""
         root = self.storage.root
         if root is not None and root.stat().st_dev == self.path.stat().st_dev:
             return  # they are linked
-        missing = sum(entry.size for path, entry in wanted.items() if not is_whole(path, entry))
+        missing = sum(entry.size for path, entry in files.items() if not is_whole(path, entry))
         if missing and (short := shortage(missing)) is not None:
             raise short
 
@@ -209,14 +209,14 @@ def tile_folders(job_id: str) -> list[Path]:
 
 def remove_remade(folder: Path) -> bool:
     """Delete what an attempt would make anew; return whether there was any. The caller holds the folder's lock."""
-    found = [path for name in _REMADE if (path := folder / name).exists()]
-    found += [path for name in LEFT_BY_KILLED for path in (folder / "run" / TILES / UNITS).glob(name)]
-    for path in found:
+    paths = [path for name in _REMADE if (path := folder / name).exists()]
+    paths += [path for name in LEFT_BY_KILLED for path in (folder / "run" / TILES / UNITS).glob(name)]
+    for path in paths:
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)
         else:
             path.unlink(missing_ok=True)
-    return bool(found)
+    return bool(paths)
 
 
 def bytes_in(folder: Path) -> int:

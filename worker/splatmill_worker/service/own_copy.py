@@ -28,8 +28,8 @@ def link_or_copy(source: Path, target: Path) -> None:
 
 
 def _clone_or_copy(source: Path, target: Path) -> None:
-    with source.open("rb") as given, target.open("wb") as taken:
+    with source.open("rb") as original, target.open("wb") as taken:
         with suppress(OSError):  # most file systems clone nothing, and none does to another one
-            fcntl.ioctl(taken.fileno(), FICLONE, given.fileno())
+            fcntl.ioctl(taken.fileno(), FICLONE, original.fileno())
             return
-        shutil.copyfileobj(given, taken, 1 << 20)
+        shutil.copyfileobj(original, taken, 1 << 20)

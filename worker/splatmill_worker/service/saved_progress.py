@@ -18,14 +18,14 @@ class SavedProgress:
         run = work_folder(job_id) / "run"
         self._run = run
         self._may_download = not run.is_dir()
-        self._seen = self._newest()
+        self._latest = self._newest()
 
     def advanced(self) -> bool:
         """Return whether the attempt has stored a checkpoint since the last call."""
         newest = self._newest()
-        if newest == self._seen:
+        if newest == self._latest:
             return False
-        self._seen = newest
+        self._latest = newest
         downloaded, self._may_download = self._may_download, False
         return not downloaded
 

@@ -28,17 +28,17 @@ def served_lines(named: str | None) -> tuple[Line, ...]:
 
     Raises UnservedLines for an unknown name, and for `gpu` where no GPU is usable.
     """
-    wanted = [name.strip() for name in (named or "").split(",") if name.strip()]
-    if unknown := sorted(set(wanted) - set(LINES)):
+    names = [name.strip() for name in (named or "").split(",") if name.strip()]
+    if unknown := sorted(set(names) - set(LINES)):
         raise UnservedLines(f"There is no queue {', '.join(unknown)}. The queues are {', '.join(LINES)}.")
-    if wanted and "gpu" not in wanted:
-        return tuple(line for line in LINES if line in wanted)
+    if names and "gpu" not in names:
+        return tuple(line for line in LINES if line in names)
     reason = gpu_absence()
-    if wanted and reason:
+    if names and reason:
         raise UnservedLines(
             f"The queue gpu was requested, but this machine cannot serve it. {reason} Leave gpu out, or correct this."
         )
-    return tuple(line for line in LINES if line in (wanted or LINES) and (line != "gpu" or not reason))
+    return tuple(line for line in LINES if line in (names or LINES) and (line != "gpu" or not reason))
 
 
 def gpu_absence() -> str:

@@ -22,15 +22,15 @@ def is_whole(path: Path, entry: Entry) -> bool:
     return path.is_file() and not path.is_symlink() and path.stat().st_size == entry.size
 
 
-def stage(storage: Storage, wanted: Mapping[Path, Entry], report: Report) -> None:
+def stage(storage: Storage, files: Mapping[Path, Entry], report: Report) -> None:
     """Make each path a file with the bytes of its entry, unless it is one already.
 
     Files of a local storage are linked, or copied where it lies on another file system. One that is deleted from
     storage meanwhile, or is both a file and a folder, which buckets allow, is left out. Raises StorageError, OSError,
     and what `report` raises; files that are under way then are finished first.
     """
-    missing = {path: entry for path, entry in wanted.items() if not is_whole(path, entry)}
-    done = len(wanted) - len(missing)
+    missing = {path: entry for path, entry in files.items() if not is_whole(path, entry)}
+    done = len(files) - len(missing)
     lock, stopped = threading.Lock(), threading.Event()
 
     def bring(path: Path, entry: Entry) -> None:
@@ -46,7 +46,7 @@ def stage(storage: Storage, wanted: Mapping[Path, Entry], report: Report) -> Non
                     link_or_copy(source, path)
             with lock:
                 done += 1
-                report(done, len(wanted))
+                report(done, len(files))
         except BaseException:
             stopped.set()
             raise
@@ -62,14 +62,14 @@ def stage(storage: Storage, wanted: Mapping[Path, Entry], report: Report) -> Non
         task.result()
 
 
-def fetch(storage: Storage, wanted: Mapping[Path, Entry]) -> None:
+def fetch(storage: Storage, files: Mapping[Path, Entry]) -> None:
     """Make each path a file with the bytes of its entry, whatever was there, as `stage` does.
 
     Raises FileNotFoundError for a file that is deleted from storage meanwhile.
     """
-    for path in wanted:
+    for path in files:
         path.unlink(missing_ok=True)
-    stage(storage, wanted, lambda done, total: None)
-    for path, entry in wanted.items():
+    stage(storage, files, lambda done, total: None)
+    for path, entry in files.items():
         if not path.is_file():
             raise FileNotFoundError(f"{entry.path} was deleted from storage while it was being read.")

@@ -157,7 +157,7 @@ def _retried(run: SfmRun, result: EffortResult) -> set[int] | None:
 
 def require_features(run: SfmRun, result: EffortResult) -> None:
     """Raise SfmFailed when half of the photos have too few features."""
-    median = float(np.median([len(found.scales) for found in result.features]))
+    median = float(np.median([len(each.scales) for each in result.features]))
     least = 2 * two_view.MIN_INLIERS
     if median < least:
         raise SfmFailed(

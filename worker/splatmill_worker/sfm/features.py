@@ -132,9 +132,9 @@ def copy_without_pairs(source: Path, target: Path, left_out: Iterable[tuple[int,
 
 def photos_in(path: Path, *, with_features: bool) -> set[int]:
     """Indices of the photos in COLMAP's database at `path`: of all, or of those with features."""
-    found = "images JOIN descriptors USING (image_id)" if with_features else "images"
+    table = "images JOIN descriptors USING (image_id)" if with_features else "images"
     with closing(_read_only(path)) as database:
-        return {photo_index(name) for (name,) in database.execute(f"SELECT name FROM {found}")}
+        return {photo_index(name) for (name,) in database.execute(f"SELECT name FROM {table}")}
 
 
 def completed(path: Path, features_of: Collection[int]) -> None:
@@ -188,15 +188,15 @@ def load(
     only: indices of the photos that features are read of; the others have none. None: all.
     """
     ids = {photo_index(image.name): image.image_id for image in database.read_all_images()}
-    found = []
+    features = []
     for index in sorted(ids):
         if only is not None and index not in only:
-            found.append(NO_FEATURES)
+            features.append(NO_FEATURES)
             continue
         keypoints = np.asarray(database.read_keypoints(ids[index]), np.float32)
         descriptors = np.asarray(database.read_descriptors(ids[index]).data, np.uint8)
-        found.append(Features(keypoints[:, :2].astype(np.float64), keypoints[:, 2], descriptors))
-    return ids, found
+        features.append(Features(keypoints[:, :2].astype(np.float64), keypoints[:, 2], descriptors))
+    return ids, features
 
 
 def _reduced(photo: UsablePhoto, side: int) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8] | None]:
@@ -237,7 +237,7 @@ def _write_camera(
         database.write_rig(rig, use_rig_id=True)
 
 
-def _write_features(database: pycolmap.Database, number: int, index: int, found: Features) -> None:
+def _write_features(database: pycolmap.Database, number: int, index: int, features: Features) -> None:
     """Write the features of photo `index`, and the photo as one of camera `number` where the database has it not."""
     image_id = index + 1
     with pycolmap.DatabaseTransaction(database):
@@ -249,9 +249,9 @@ def _write_features(database: pycolmap.Database, number: int, index: int, found:
             frame.add_data_id(image.data_id)
             database.write_frame(frame, use_frame_id=True)
         # COLMAP's third and fourth columns are scale and orientation; orientations are not used.
-        columns = found.points, found.scales, np.zeros(len(found.scales))
+        columns = features.points, features.scales, np.zeros(len(features.scales))
         if not database.exists_keypoints(image_id):
             database.write_keypoints(image_id, np.column_stack(columns).astype(np.float32))
         database.write_descriptors(
-            image_id, pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, found.descriptors)
+            image_id, pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, features.descriptors)
         )

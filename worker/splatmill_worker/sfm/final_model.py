@@ -62,7 +62,7 @@ def final_model(run: SfmRun, result: EffortResult) -> FinalModel:
         model, warnings = _polished(run, result, model, fixed)
     facts |= checks.model_facts(model, run.count)
     checks.require_usable(facts)
-    facts["features_per_photo"] = float(np.median([len(found.scales) for found in result.features]))
+    facts["features_per_photo"] = float(np.median([len(each.scales) for each in result.features]))
     facts |= _mapper_facts(run, mapped, model)
     left_out = _reasons(run, result, mapped, model) | outliers
     return FinalModel(model, facts, left_out, (*run.notes, *mapped.notes), warnings)

@@ -49,4 +49,4 @@ def placed(model: pycolmap.Reconstruction, names: Sequence[str]) -> Placed:
         camera = replace(without_distortion(model.cameras[image.camera_id]), viewmat=viewmat)
         cameras.append((names[features.photo_index(image.name)], camera))
     points = np.array([point.xyz for point in model.points3D.values()], np.float64).reshape(-1, 3)
-    return Placed(tuple(sorted(cameras, key=lambda found: found[0])), points)
+    return Placed(tuple(sorted(cameras, key=lambda entry: entry[0])), points)

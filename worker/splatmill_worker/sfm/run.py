@@ -59,7 +59,7 @@ class EffortResult:
     @property
     def verified(self) -> list[Pair]:
         """The edges of the view graph: pairs with enough inliers."""
-        return [pair for pair, found in self.matched.items() if found.inliers >= MIN_INLIERS]
+        return [pair for pair, outcome in self.matched.items() if outcome.inliers >= MIN_INLIERS]
 
     @property
     def view_graph(self) -> Path:

@@ -178,7 +178,7 @@ class _Unfolding:
 
     def _note(self, leap: Pair, alike: int, better: bool) -> None:
         first, second = (self._run.prepared.photos[photo].name for photo in leap)
-        found = (
+        finding = (
             f"Sides of the scene look alike: {alike} pairs of photos match because of it, and the cameras that they "
             f"led to leap between photos that were taken one after the other (first {first} and {second})."
         )
@@ -188,7 +188,7 @@ class _Unfolding:
             else "Mapping without these pairs gave no better cameras: the sides may lie on each other in the model. "
             "Take more photos on the way from one side to the other, with more of the surroundings in them."
         )
-        self._run.notes.append(f"{found} {outcome}")
+        self._run.notes.append(f"{finding} {outcome}")
 
 
 class _Placement:

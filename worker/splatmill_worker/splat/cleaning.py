@@ -94,12 +94,12 @@ def clean(
     backend: the kernels; chosen by the tensors' device where None.
     """
 
-    def seen(rows: Tensor) -> Evidence:
+    def evidence_for(rows: Tensor) -> Evidence:
         return evidence_of(gaussians.select(rows), photos, background, antialias=antialias, backend=backend)
 
     rows = torch.arange(gaussians.count, device=gaussians.means.device)
     batch = max(1, math.ceil(FIRST_SHARE * gaussians.count))
-    evidence = first = seen(rows)
+    evidence = first = evidence_for(rows)
     removed: dict[Reason, int] = dict.fromkeys(get_args(Reason), 0)
     stays = torch.zeros_like(rows, dtype=torch.bool)
     refused = 0
@@ -110,11 +110,11 @@ def clean(
             break
         going[torch.argsort(harm, descending=True, stable=True)[batch:]] = False
         left = rows[~going]
-        found = seen(left)
-        if found.psnr > evidence.psnr and bool((found.psnrs >= first.psnrs - MOST_LOST).all()):
+        trial = evidence_for(left)
+        if trial.psnr > evidence.psnr and bool((trial.psnrs >= first.psnrs - MOST_LOST).all()):
             for reason, number in _by_reason(gaussians.select(rows), evidence, going).items():
                 removed[reason] += number
-            rows, evidence, batch = left, found, 2 * batch
+            rows, evidence, batch = left, trial, 2 * batch
             continue
         refused += 1
         if int(going.sum()) == 1:

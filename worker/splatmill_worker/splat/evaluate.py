@@ -125,13 +125,13 @@ def compare(name: str, color: Tensor, photo: Tensor, mask: Tensor | None = None)
     truth = photo.to(image.device).float() / 255.0
     counted = mask.to(image.device) if mask is not None and bool(mask.any()) else None
     shown = image.reshape(-1, 3) if counted is None else image[counted]
-    wanted = truth.reshape(-1, 3) if counted is None else truth[counted]
+    target = truth.reshape(-1, 3) if counted is None else truth[counted]
     # The kernels' SSIM, which the loss is made of: a curve is evaluated every few seconds, and plain torch is too slow.
     similarity = 1.0 - float(
         ops.loss(image, photo.to(image.device).contiguous(), mask=counted, dssim_weight=1.0)
     )
-    mse = _mse(shown, wanted)
-    fitted = _mse(color_fitted(shown, wanted), wanted)
+    mse = _mse(shown, target)
+    fitted = _mse(color_fitted(shown, target), target)
     return ViewScore(name, mse, psnr(mse), similarity, psnr(fitted))
 
 

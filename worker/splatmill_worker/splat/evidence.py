@@ -89,7 +89,7 @@ def evidence_of(
     n, like = gaussians.count, gaussians.means
     zero = like.new_zeros(n, dtype=torch.float64)
     weight, peak, support = zero.clone(), zero.clone(), zero.clone()
-    seen = torch.zeros(n, dtype=torch.int64, device=like.device)
+    counts = torch.zeros(n, dtype=torch.int64, device=like.device)
     extent, depth = like.new_zeros(n), torch.full_like(zero, float("inf"))
     random = torch.Generator().manual_seed(seed)
     decibels: list[float] = []
@@ -99,12 +99,12 @@ def evidence_of(
         decibels.append(one.psnr)
         weight += one.weight
         peak = torch.maximum(peak, one.weight)
-        seen += shown
+        counts += shown
         support += one.support
         extent = torch.where(shown, torch.maximum(extent, one.extent), extent)
         depth = torch.where(shown, torch.minimum(depth, one.depth), depth)
     psnrs = torch.tensor(decibels, dtype=torch.float64)
-    return Evidence(weight, peak, seen, support, extent, depth, psnrs)
+    return Evidence(weight, peak, counts, support, extent, depth, psnrs)
 
 
 @dataclass(frozen=True)

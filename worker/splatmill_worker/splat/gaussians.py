@@ -42,10 +42,10 @@ class Gaussians:
         n = self.means.shape[0]
         expected = {"means": (n, 3), "log_scales": (n, 3), "quats": (n, 4), "logit_opacities": (n,)}
         for name, shape in expected.items():
-            seen = tuple(getattr(self, name).shape)
-            if seen != shape:
+            actual = tuple(getattr(self, name).shape)
+            if actual != shape:
                 raise ValueError(
-                    f"{name} has shape {seen} where {shape} is needed; pass one row per Gaussian."
+                    f"{name} has shape {actual} where {shape} is needed; pass one row per Gaussian."
                 )
         if (
             self.sh.ndim != 3
@@ -100,12 +100,12 @@ class Gaussians:
 
     def padded(self, degree: int) -> Gaussians:
         """The same Gaussians at SH degree `degree`: coefficients of zero are added, or higher ones cut off."""
-        wanted = (degree + 1) ** 2
+        coefficients = (degree + 1) ** 2
         have = self.sh.shape[1]
-        if wanted <= have:
-            sh = self.sh[:, :wanted]
+        if coefficients <= have:
+            sh = self.sh[:, :coefficients]
         else:
-            sh = torch.cat([self.sh, self.sh.new_zeros(self.count, wanted - have, 3)], dim=1)
+            sh = torch.cat([self.sh, self.sh.new_zeros(self.count, coefficients - have, 3)], dim=1)
         return Gaussians(self.means, self.log_scales, self.quats, self.logit_opacities, sh)
 
     def moved(self, scale: float, translation: Tensor) -> Gaussians:

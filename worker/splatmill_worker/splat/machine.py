@@ -27,17 +27,17 @@ def machine() -> dict[str, Any]:
 
 def versions(kernels: str) -> dict[str, Any]:
     """Versions of Python and of the packages that compute, and the backend `kernels` that was used."""
-    found: dict[str, Any] = {"python": platform.python_version(), "backend": kernels}
+    record: dict[str, Any] = {"python": platform.python_version(), "backend": kernels}
     for package in PACKAGES:
         try:
-            found[package] = metadata.version(package)
+            record[package] = metadata.version(package)
         except metadata.PackageNotFoundError:
-            found[package] = None
+            record[package] = None
     if kernels == "cpu":
         from splatmill_worker.kernels.cpu import isa
 
-        found["instruction_set"] = isa.chosen()
-    return found
+        record["instruction_set"] = isa.chosen()
+    return record
 
 
 def peak_memory() -> int:

@@ -19,9 +19,9 @@ def main() -> int:
     parser.add_argument("--height", type=int, default=480)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--samples", type=int, default=2, help="rays per pixel along each axis")
-    given = parser.parse_args()
-    capture(given.directory, given.count, given.width, given.height, given.seed, given.samples)
-    print(f"{given.count} photos of the built-in still life are in {given.directory}")
+    options = parser.parse_args()
+    capture(options.directory, options.count, options.width, options.height, options.seed, options.samples)
+    print(f"{options.count} photos of the built-in still life are in {options.directory}")
     return 0
 
 

@@ -88,15 +88,15 @@ def do_part(
     if job.prepared is None or not has_parts(photos, job.capture, known, job.options):
         return {}
     kind = name.partition("-")[0]
-    found, options = job.prepared, sfm_options(job.options)
+    prepared, options = job.prepared, sfm_options(job.options)
     report, stop = progress_events(job.emit), job.cancelled
     if kind == "pairs":
-        facts = {"pairs": blocks.score_pairs(found, job.workdir, options, others, report, stop)}
+        facts = {"pairs": blocks.score_pairs(prepared, job.workdir, options, others, report, stop)}
     elif kind == "features":
         block = block_of(name, parts)
-        facts = {"photos": blocks.find_block(found, job.workdir, options, block, report, stop)}
+        facts = {"photos": blocks.find_block(prepared, job.workdir, options, block, report, stop)}
     else:
         block = block_of(name, parts)
-        facts = {"pairs": blocks.match_block(found, job.workdir, options, block, others, report, stop)}
+        facts = {"pairs": blocks.match_block(prepared, job.workdir, options, block, others, report, stop)}
     shutil.move(job.workdir / SFM, out / SFM)
     return facts

@@ -241,8 +241,8 @@ def _do_all(root: Path) -> int:
             time.sleep(POLL_SECONDS)
         else:
             if free[0] in folder.plan.camera_names:  # short ones, for which one process is started
-                wanted = folder.plan.wanted(states)
-                free = [name for name in folder.plan.camera_names if name in wanted]
+                pending = folder.plan.pending(states)
+                free = [name for name in folder.plan.camera_names if name in pending]
             status, last = _in_process(root, free, stopped)
             if stopped.asked:
                 raise KeyboardInterrupt
@@ -314,7 +314,7 @@ def _left_out(folder: PlanFolder) -> set[str]:
     ended, states = folder.ended(), folder.states()
     photos = ended.get("photos")
     divided = photos is None or photos.path is None or facts_of(photos.path).get(DIVIDED, True)
-    names = {unit.name for unit in folder.plan.units} - folder.plan.wanted(states) - set(ended)
+    names = {unit.name for unit in folder.plan.units} - folder.plan.pending(states) - set(ended)
     return names if divided else names.union(folder.plan.camera_names[1:-1])
 
 

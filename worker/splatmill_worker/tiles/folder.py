@@ -124,20 +124,20 @@ class PlanFolder:
 
     def ended(self) -> dict[str, Ended]:
         """How units have ended, by name, in the order of the plan."""
-        found: dict[str, Ended] = {}
+        ends: dict[str, Ended] = {}
         states: dict[str, State] = {}
         for unit in self.plan.units:
             if self.plan.depends_on_failures(unit.name) and self.plan.missing(unit.name, states):
                 continue  # the name of its output is not known yet
             path = self._path(unit.name, states)
             if (path / DONE).is_file():
-                found[unit.name] = Ended("done", path)
+                ends[unit.name] = Ended("done", path)
             elif (failure := _read(path.with_suffix(".failed.json"))) is not None:
-                found[unit.name] = Ended("failed", None, str(failure["failure"]), str(failure["advice"]))
+                ends[unit.name] = Ended("failed", None, str(failure["failure"]), str(failure["advice"]))
             else:
                 continue
-            states[unit.name] = found[unit.name].state
-        return found
+            states[unit.name] = ends[unit.name].state
+        return ends
 
     def running(self, name: str, states: dict[str, State] | None = None) -> str | None:
         """Which process runs the unit, as text; None where none does. states: those there are, where they are known."""

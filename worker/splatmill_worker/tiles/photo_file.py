@@ -58,9 +58,9 @@ def read_photos(path: Path) -> tuple[TrainingView, ...]:
     if not len(names):
         return ()
     pixels = np.memmap(path.with_suffix(PIXELS), np.uint8, "r")
-    wanted = int((sizes.prod(axis=1) * (3 + planes.sum(axis=1))).sum())
-    if len(pixels) != wanted:
-        raise ValueError(f"{path.with_suffix(PIXELS)} has {len(pixels)} bytes; its photos have {wanted}.")
+    total = int((sizes.prod(axis=1) * (3 + planes.sum(axis=1))).sum())
+    if len(pixels) != total:
+        raise ValueError(f"{path.with_suffix(PIXELS)} has {len(pixels)} bytes; its photos have {total}.")
     views, begin = [], 0
 
     def plane(*shape: int) -> Tensor:

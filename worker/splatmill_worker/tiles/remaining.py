@@ -32,7 +32,7 @@ class Remaining:
             return sum(each not in seconds and each != name for each in names)
 
         def known(names: tuple[str, ...]) -> tuple[float, ...]:
-            return tuple(took for each in names if (took := seconds.get(each)) is not None)
+            return tuple(duration for each in names if (duration := seconds.get(each)) is not None)
 
         tiles = plan.tile_names
         seams = tuple(  # those of a tile that failed have nothing to do

@@ -220,17 +220,17 @@ def _views(tile: Tile, whole: Gaussians, members: Tensor) -> Iterator[TrainingVi
     """
     coarse, room = tile.coarse, Room.of(tile.job)
     cameras = [view.full.camera for view in coarse.views]
-    found = []
+    pairs = []
     for view, part in zip(
         coarse.views, parts(whole, members, cameras, antialias=coarse.plan.antialias), strict=True
     ):
         stop_if(tile.job.cancelled)
         if part is not None and bool(part.counted_of(view).any()):
-            found.append((view, part))
-    taken = BYTES_PER_PIXEL * sum(part.pixels for _, part in found)
+            pairs.append((view, part))
+    taken = BYTES_PER_PIXEL * sum(part.pixels for _, part in pairs)
     files = None if fit_in_memory(taken, room.memory) else PixelFiles(room.folder)
-    for done, (view, part) in enumerate(found, 1):
+    for done, (view, part) in enumerate(pairs, 1):
         stop_if(tile.job.cancelled)
         shown = part.of(view)
         yield shown if files is None else shown.placed(files)
-        tile.job.emit(ProgressEvent(stage="loading", done=done, total=len(found)))
+        tile.job.emit(ProgressEvent(stage="loading", done=done, total=len(pairs)))

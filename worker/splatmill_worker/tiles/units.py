@@ -153,27 +153,27 @@ class ScenePlan:
     def ready(self, states: Mapping[str, State]) -> list[str]:
         """Names of the units that the scene needs, that have not ended and whose needs are met, in the order of the
         plan."""
-        wanted = self.wanted(states)
+        pending = self.pending(states)
         return [
-            unit.name for unit in self.units if unit.name in wanted and not self.missing(unit.name, states)
+            unit.name for unit in self.units if unit.name in pending and not self.missing(unit.name, states)
         ]
 
-    def wanted(self, states: Mapping[str, State]) -> set[str]:
+    def pending(self, states: Mapping[str, State]) -> set[str]:
         """The units that have not ended and that the scene still needs: not those before the cameras, once these are
         there."""
-        found: set[str] = set()
+        names: set[str] = set()
         left = ["scene"]
         while left:
             name = left.pop()
-            if name not in states and name not in found:
-                found.add(name)
+            if name not in states and name not in names:
+                names.add(name)
                 left += self.unit(name).needs
-        return found
+        return names
 
     def needed(self, states: Mapping[str, State]) -> set[str]:
         """The units that the scene still needs, and those that they read."""
-        wanted = self.wanted(states)
-        return wanted.union(need for name in wanted for need in self.unit(name).needs)
+        pending = self.pending(states)
+        return pending.union(need for name in pending for need in self.unit(name).needs)
 
     def missing(self, name: str, states: Mapping[str, State]) -> list[str]:
         """The units that must end before the unit `name` can be run."""

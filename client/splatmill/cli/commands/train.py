@@ -24,7 +24,7 @@ from splatmill.cli.servers import open_client
 from splatmill.errors import JobCancelled
 from splatmill.schema import Capture, TrainOptions, format_bytes
 from splatmill.schema.quantities import listed
-from splatmill.transfer.local_capture import Found, LocalFile, find_files, printable, start_model
+from splatmill.transfer.local_capture import CaptureFiles, LocalFile, find_files, printable, start_model
 from splatmill.transfer.training_options import train_options, with_start_model
 
 if TYPE_CHECKING:
@@ -152,7 +152,7 @@ def train(
             outputs(_follow(submit, verbose))
 
 
-def _announce(files: Found) -> None:
+def _announce(files: CaptureFiles) -> None:
     typer.echo(f"{', '.join(files.contents())}, {format_bytes(files.bytes)}")
     if files.top:
         typer.echo(f"cameras: those in {printable(files.top)}")

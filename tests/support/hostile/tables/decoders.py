@@ -69,7 +69,7 @@ def _outcomes() -> dict[str, str]:
             path.write_bytes(b"of others")
         decoders = Decoders([photo.parent])
         try:
-            found = {
+            outcomes = {
                 name: decoders.call(Call(known.attempt, outside, (name, os.getpid())), str, UnusablePicture)
                 for name in ACTS
             }
@@ -78,11 +78,11 @@ def _outcomes() -> dict[str, str]:
                 try:
                     decoders.call(call, decode.picture_of, UnusablePicture)
                 except UnusablePicture as error:
-                    found[name] = error.reason
+                    outcomes[name] = error.reason
                 decoders.forget_ended()
         finally:
             decoders.close()
-        return found
+        return outcomes
 
 
 def _act(name: str) -> Answer:

@@ -19,10 +19,10 @@ _FAR = "9999999999999999999-0"
 
 def _received(link: socket.socket, end: bytes) -> bytes:
     """What arrives until `end` has."""
-    found = b""
-    while end not in found and (chunk := link.recv(65536)):
-        found += chunk
-    return found
+    buffer = b""
+    while end not in buffer and (chunk := link.recv(65536)):
+        buffer += chunk
+    return buffer
 
 
 def _kind(answer: bytes) -> str:

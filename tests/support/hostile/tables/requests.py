@@ -85,8 +85,8 @@ def _long_key(bench: Bench) -> Answer:
     return bench.post("/v1/jobs", {"capture": bench.capture()}, *header)
 
 
-def _range(bench: Bench, wanted: str) -> Answer:
-    return bench.request(f"GET /v1/models/{_model(bench)}/files/model.ply", b"", f"Range: {wanted}")
+def _range(bench: Bench, ranges: str) -> Answer:
+    return bench.request(f"GET /v1/models/{_model(bench)}/files/model.ply", b"", f"Range: {ranges}")
 
 
 def _model(bench: Bench) -> str:

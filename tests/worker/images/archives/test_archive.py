@@ -163,6 +163,6 @@ def test_results_of_a_training_in_a_zip_are_no_photos(tmp_path: Path) -> None:
     shots = {f"{number}.png": pictures.photo(number) for number in range(2)}
     results = {"splat/model.ply": b"ply", "splat/report.json": b"{}", "splat/preview.jpg": pictures.photo(2)}
     zipped(images, shots | results)
-    found = prepare.prepare(images, None, tmp_path / "work")
-    assert [photo.name for photo in found.photos] == ["set/0.png", "set/1.png"]
-    assert ("set/splat/preview.jpg", "it is a result of Splatmill, not a photo") in found.skipped
+    prepared = prepare.prepare(images, None, tmp_path / "work")
+    assert [photo.name for photo in prepared.photos] == ["set/0.png", "set/1.png"]
+    assert ("set/splat/preview.jpg", "it is a result of Splatmill, not a photo") in prepared.skipped

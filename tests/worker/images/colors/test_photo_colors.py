@@ -137,9 +137,9 @@ def test_alpha_stays_and_grey_has_a_profile_too(tmp_path: Path) -> None:
     Image.fromarray(np.concatenate([stored(TO_P3), alpha], axis=2)).save(
         tmp_path / "a.png", icc_profile=DISPLAY_P3
     )
-    found = np.asarray(decode.decode(tmp_path / "a.png"), int)
-    assert (found[..., 3:] == alpha).all()
-    assert np.abs(found[..., :3] - chart()).mean() < 1.5
+    pixels = np.asarray(decode.decode(tmp_path / "a.png"), int)
+    assert (pixels[..., 3:] == alpha).all()
+    assert np.abs(pixels[..., :3] - chart()).mean() < 1.5
     grey = chart()[..., 0]
     light = linear(grey) ** (1 / 1.8) * 255
     Image.fromarray(light.round().astype(np.uint8)).save(
@@ -339,9 +339,9 @@ def test_a_profile_of_grey_holds_with_transparent_pixels_too(tmp_path: Path) -> 
     Image.merge("LA", [Image.fromarray(light), Image.fromarray(alpha)]).save(
         tmp_path / "a.png", icc_profile=profile
     )
-    found = np.asarray(decode.decode(tmp_path / "a.png"), int)
-    assert np.abs(found[..., 0] - grey.astype(int)).mean() < 1.0
-    assert (found[..., 3] == 200).all()
+    pixels = np.asarray(decode.decode(tmp_path / "a.png"), int)
+    assert np.abs(pixels[..., 0] - grey.astype(int)).mean() < 1.0
+    assert (pixels[..., 3] == 200).all()
 
 
 def test_lab_and_cmyk_without_a_profile(tmp_path: Path) -> None:
@@ -462,9 +462,9 @@ def test_photos_that_come_with_cameras_are_named_too(tmp_path: Path) -> None:
             tmp_path / "images" / name, icc_profile=profile, quality=90 + number
         )
     (tmp_path / "transforms.json").write_text(json.dumps({"camera_angle_x": 1.0, "frames": frames(names)}))
-    given = posed.find(tmp_path)
-    assert given is not None
-    assert "Colours of 2 of 3 photos: converted to sRGB from Display P3." in given.load().warnings
+    poses = posed.find(tmp_path)
+    assert poses is not None
+    assert "Colours of 2 of 3 photos: converted to sRGB from Display P3." in poses.load().warnings
 
 
 def test_masks_keep_black_and_white_whatever_their_profile(tmp_path: Path) -> None:

@@ -191,20 +191,20 @@ def test_photos_with_cameras_are_left_out_and_the_job_is_tried_again_likewise(
     capture = tmp_path / "capture"
     posed_sets.photos(capture / "images", ["0.png", "1.png"])
     posed_sets.transforms(capture / "transforms.json", posed_sets.frames(["0.png", "1.png"]))
-    given = posed.find(capture)
-    assert given is not None
+    poses = posed.find(capture)
+    assert poses is not None
     with confined([capture]):
         with monkeypatch.context() as patch:
             Killer(patch, "ask", 2)
-            scene = given.load()
+            scene = poses.load()
             assert [view.name for view in scene.views] == ["1.png"]
             assert "ended twice" in dict(scene.left_out)["0.png"]
         with monkeypatch.context() as patch:
             Killer(patch, "ask", 1000)
             with pytest.raises(UnusablePicture, match="no photo is left") as caught:
-                given.load()
+                poses.load()
             assert is_transient(caught.value)
-        assert len(given.load().views) == 2
+        assert len(poses.load().views) == 2
 
 
 @pytest.mark.slow
@@ -280,7 +280,7 @@ class OneByOne:
 
 def test_a_video_is_begun_anew(photos: Path, confinement: Decoders, tmp_path: Path) -> None:
     (photos / "walk.mp4").write_bytes(video(frames=40))
-    wanted = dict(video_here.keyframes(photos / "walk.mp4", 6))
+    frames = dict(video_here.keyframes(photos / "walk.mp4", 6))
     written: list[tuple[int, bytes]] = []
 
     def write(number: int, picture: bytes) -> None:
@@ -290,8 +290,8 @@ def test_a_video_is_begun_anew(photos: Path, confinement: Decoders, tmp_path: Pa
                 os.kill(pid, signal.SIGKILL)
 
     confinement.keyframes(photos / "walk.mp4", 6, write, lambda: False)
-    assert dict(written) == wanted
-    assert len(written) >= len(wanted)
+    assert dict(written) == frames
+    assert len(written) >= len(frames)
 
 
 def test_a_video_that_ends_its_process_twice_is_left_out(
@@ -318,9 +318,9 @@ def test_points_whose_reader_is_ended_twice_end_the_attempt_and_not_the_points(
     axes = "".join(f"property float {axis}\n" for axis in "xyz")
     header = f"ply\nformat ascii 1.0\nelement vertex 1\n{axes}end_header\n"
     (photos / "poses" / "points.ply").write_text(header + "1 2 3\n")
-    found = posed.find(photos)
-    assert found is not None
-    assert len(found.load().points) == 1
+    poses = posed.find(photos)
+    assert poses is not None
+    assert len(poses.load().points) == 1
     original = decoders.call_once
 
     def killed(*arguments: Any, **options: Any) -> Any:
@@ -330,7 +330,7 @@ def test_points_whose_reader_is_ended_twice_end_the_attempt_and_not_the_points(
 
     monkeypatch.setattr(decoders, "call_once", killed)
     with pytest.raises(Refusal, match="ended twice") as caught:
-        found.load()
+        poses.load()
     assert is_transient(caught.value)
 
 

@@ -71,7 +71,7 @@ def dashboard(pen: ImageDraw.ImageDraw, number: int) -> None:
 
 
 # What is drawn, at which places (x, y) it is masked, and which share of the photo at most.
-FOUND: dict[str, tuple[Draw, tuple[tuple[int, int], ...], float]] = {
+MASKED: dict[str, tuple[Draw, tuple[tuple[int, int], ...], float]] = {
     "a logo": (drawn(lambda pen, k: letters(pen, 10, 215)), ((60, 222),), 0.08),
     "a half transparent one": (drawn(lambda pen, k: letters(pen, 180, 8), 0.5), ((240, 15),), 0.08),
     "two": (
@@ -98,7 +98,7 @@ def prepared(tmp_path: Path, change: Draw, count: int = 16) -> Prepared:
     return prepare(folder, None, tmp_path / "work")
 
 
-@pytest.mark.parametrize(("draw", "places", "most"), FOUND.values(), ids=FOUND.keys())
+@pytest.mark.parametrize(("draw", "places", "most"), MASKED.values(), ids=MASKED.keys())
 def test_what_never_moves_is_masked(
     tmp_path: Path, draw: Draw, places: tuple[tuple[int, int], ...], most: float
 ) -> None:
@@ -167,13 +167,13 @@ def test_a_part_that_is_transparent_in_all_photos_is_no_overlay() -> None:
     """As the sky of renderings, whose cameras are known. A logo in the opaque part is found all the same."""
     alpha = Image.new("L", (WIDTH, HEIGHT), 255)
     alpha.paste(0, (0, 0, WIDTH, HEIGHT // 4))
-    given = [Candidate(f"{k:02d}.png", WIDTH, HEIGHT, "") for k in range(16)]
+    candidates = [Candidate(f"{k:02d}.png", WIDTH, HEIGHT, "") for k in range(16)]
 
     def hidden(change: Draw) -> list[np.ndarray | None]:
         cut = [change(photo, k) for k, photo in enumerate(photos()[:16])]
         for photo in cut:
             photo.putalpha(alpha)
-        return list(hidden_in(given, lambda index, size: cut[index]).regions)
+        return list(hidden_in(candidates, lambda index, size: cut[index]).regions)
 
     assert hidden(lambda photo, k: photo.copy()) == [None] * 16
     (region, *_) = hidden(drawn(lambda pen, k: letters(pen, 10, 215)))
@@ -198,7 +198,7 @@ def test_the_same_is_so_where_cameras_are_recovered(tmp_path: Path) -> None:
 
 
 def test_few_photos_have_nothing_masked(tmp_path: Path) -> None:
-    assert prepared(tmp_path, FOUND["a logo"][0], MIN_PHOTOS - 1).overlays == ()
+    assert prepared(tmp_path, MASKED["a logo"][0], MIN_PHOTOS - 1).overlays == ()
 
 
 def test_a_still_background_with_detail_is_named_and_not_masked(tmp_path: Path) -> None:
@@ -220,7 +220,7 @@ def test_the_masks_of_photos_hide_both(tmp_path: Path) -> None:
     folder = tmp_path / "images"
     folder.mkdir()
     for k, photo in enumerate(photos()):
-        FOUND["a logo"][0](photo, k).save(folder / f"{k:02d}.jpg", quality=92)
+        MASKED["a logo"][0](photo, k).save(folder / f"{k:02d}.jpg", quality=92)
     result = prepare(folder, tmp_path / "masks", tmp_path / "work")
     path = result.photos[3].mask
     assert path is not None
@@ -240,10 +240,12 @@ def test_round_pictures_are_found_by_folder_and_what_is_still_within_them_too() 
         return Image.fromarray(pixels)
 
     radii = {"a": 118.0, "b": None, "c": 100.0}
-    given = [Candidate(f"{folder}/{number}", 320, 240, folder) for folder in radii for number in range(5)]
-    pictures = [taken(radii[each.source]) for each in given]
-    hidden = hidden_in(given, lambda index, size: pictures[index])
-    for each, region, circle in zip(given, hidden.regions, hidden.circles, strict=True):
+    candidates = [
+        Candidate(f"{folder}/{number}", 320, 240, folder) for folder in radii for number in range(5)
+    ]
+    pictures = [taken(radii[each.source]) for each in candidates]
+    hidden = hidden_in(candidates, lambda index, size: pictures[index])
+    for each, region, circle in zip(candidates, hidden.regions, hidden.circles, strict=True):
         radius = radii[each.source]
         assert (radius is None) == (circle is None) == (region is None)
         if radius is not None and circle is not None and region is not None:
@@ -262,8 +264,8 @@ def test_a_ball_that_was_cut_out_is_no_round_picture() -> None:
         levels = np.where(inside[..., None], rng.integers(60, 250, (240, 320, 3)), 0)
         pixels = np.concatenate([levels, np.where(inside, 255, 0)[..., None]], axis=2)
         pictures.append(Image.fromarray(pixels.astype(np.uint8)))
-    given = [Candidate(f"{number}.png", 320, 240, ".") for number in range(5)]
-    hidden = hidden_in(given, lambda index, size: pictures[index])
+    candidates = [Candidate(f"{number}.png", 320, 240, ".") for number in range(5)]
+    hidden = hidden_in(candidates, lambda index, size: pictures[index])
     assert hidden.circles == hidden.regions == (None,) * 5
-    opaque = hidden_in(given, lambda index, size: pictures[index].convert("RGB"))
+    opaque = hidden_in(candidates, lambda index, size: pictures[index].convert("RGB"))
     assert None not in opaque.circles

@@ -86,8 +86,8 @@ def test_points_go_to_the_face_that_shows_them_and_back(tmp_path: Path) -> None:
     views = [whole(tmp_path / f"{k}.jpg", pose) for k, pose in enumerate(poses)]
     ordinary = View("b.jpg", Camera(64, 48, 60, 60, 32, 24, np.eye(4)), tmp_path / "b.jpg")
     points = np.random.default_rng(0).normal(size=(200, 3)) * 3
-    seen = np.tile(np.array([0, 2, 3], np.int32), 200)
-    tracks = PointViews(np.arange(0, 601, 3), seen)
+    numbers = np.tile(np.array([0, 2, 3], np.int32), 200)
+    tracks = PointViews(np.arange(0, 601, 3), numbers)
     scene = Scene((*views, ordinary), points, np.zeros((200, 3), np.uint8), "colmap", point_views=tracks)
     cut = faces.cut(scene)
     assert len(cut.views) == 3 * 6 + 1
@@ -107,7 +107,7 @@ def test_points_go_to_the_face_that_shows_them_and_back(tmp_path: Path) -> None:
         )
     assert back.point_views is not None
     np.testing.assert_array_equal(back.point_views.offsets, tracks.offsets)
-    np.testing.assert_array_equal(back.point_views.views, seen)
+    np.testing.assert_array_equal(back.point_views.views, numbers)
 
 
 def test_scenes_without_panoramas_are_left_as_they_are() -> None:

@@ -33,9 +33,9 @@ def prepared(folder: Path) -> Prepared:
 )
 def test_panoramas_by_their_xmp_are_used_without_a_word(tmp_path: Path, xmp: bytes) -> None:
     striped(tmp_path / "images/0.jpg", xmp)
-    found = prepared(tmp_path / "images")
-    assert [photo.is_panorama for photo in found.photos] == [True]
-    assert found.warnings == ()
+    result = prepared(tmp_path / "images")
+    assert [photo.is_panorama for photo in result.photos] == [True]
+    assert result.warnings == ()
 
 
 @pytest.mark.parametrize(
@@ -52,9 +52,9 @@ def test_panoramas_by_their_xmp_are_used_without_a_word(tmp_path: Path, xmp: byt
 )
 def test_other_panoramas_are_left_out_with_a_reason(tmp_path: Path, xmp: bytes, said: str) -> None:
     striped(tmp_path / "images/0.jpg", xmp)
-    found = prepared(tmp_path / "images")
-    assert found.photos == ()
-    assert said in found.skipped[0][1]
+    result = prepared(tmp_path / "images")
+    assert result.photos == ()
+    assert said in result.skipped[0][1]
 
 
 def test_xmp_of_a_panorama_on_a_photo_of_another_shape_names_both_readings(tmp_path: Path) -> None:
@@ -83,10 +83,10 @@ def test_panoramas_by_their_edges_are_said_and_others_of_the_shape_stay_photos(t
     product = np.full((256, 512, 3), 255, np.uint8)
     product[60:200, 150:350] = random.integers(0, 256, (140, 200, 3))
     Image.fromarray(product).save(images / "product.png")
-    found = prepared(images)
-    assert [photo.name for photo in found.photos if photo.is_panorama] == ["0.jpg", "1.jpg"]
-    assert len(found.photos) == 6
-    (warning,) = found.warnings
+    result = prepared(images)
+    assert [photo.name for photo in result.photos if photo.is_panorama] == ["0.jpg", "1.jpg"]
+    assert len(result.photos) == 6
+    (warning,) = result.warnings
     assert warning.startswith("2 photos are taken for 360-degree panoramas, such as 0.jpg")
     assert "ordinary lens" in warning
 
@@ -106,9 +106,9 @@ def test_frames_of_a_360_degree_video_are_panoramas(tmp_path: Path, is_called: b
         container.mux(stream.encode())
     if is_called:
         call_spherical(path)
-    found = prepared(tmp_path / "images")
-    assert len(found.photos) > 3
-    assert {photo.is_panorama for photo in found.photos} == {is_called}
+    result = prepared(tmp_path / "images")
+    assert len(result.photos) > 3
+    assert {photo.is_panorama for photo in result.photos} == {is_called}
 
 
 @pytest.mark.slow
@@ -127,9 +127,9 @@ def test_the_tripod_below_is_masked_and_nothing_in_panoramas_without_one(tmp_pat
         Image.fromarray(pixels).save(
             tmp_path / "images" / path.name, quality=92, xmp=gpano(ProjectionType="equirectangular")
         )
-    found = prepared(tmp_path / "images")
-    assert all(photo.is_panorama and photo.mask is not None for photo in found.photos)
-    ((shown,), (warning,)) = found.overlays, found.warnings
+    result = prepared(tmp_path / "images")
+    assert all(photo.is_panorama and photo.mask is not None for photo in result.photos)
+    ((shown,), (warning,)) = result.overlays, result.warnings
     assert "at the bottom, never changes in 12 photos" in warning
     region = np.asarray(Image.fromarray(shown.region).resize((256, 128)))
     assert region[hidden].mean() > 0.98

@@ -166,8 +166,8 @@ def test_points_go_to_a_face_and_back(tmp_path: Path) -> None:
     assert cut.point_views is not None
     for view, own in zip(views, (cut.point_views.views[0::2], cut.point_views.views[1::2]), strict=True):
         ahead = (points - view.camera.center) @ view.camera.axis
-        seen = ahead > -0.45 * np.linalg.norm(points - view.camera.center, axis=1)
-        for point in np.flatnonzero(seen):
+        visible = ahead > -0.45 * np.linalg.norm(points - view.camera.center, axis=1)
+        for point in np.flatnonzero(visible):
             assert cut.views[own[point]].camera.project(points[point : point + 1]).inside.all()
     back = faces.joined(cut)
     assert back.point_views is not None

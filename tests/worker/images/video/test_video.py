@@ -42,7 +42,7 @@ def wall() -> Image.Image:
 WALL = wall()
 
 
-def seen(left: float, blur: float = 0.0) -> Image.Image:
+def shot(left: float, blur: float = 0.0) -> Image.Image:
     """What a camera shows whose left edge is at `left`, in pixels of the wall."""
     frame = WALL.transform(
         (WIDTH, HEIGHT), Image.Transform.AFFINE, (1, 0, left, 0, 1, 0), Image.Resampling.BILINEAR
@@ -66,7 +66,7 @@ def numbers(paths: list[Path]) -> list[int]:
 
 def small(left: float, scale: float = 1.0) -> npt.NDArray[np.float32]:
     """The wall from `left` on, in grey, 96 x 72 pixels; enlarged about its middle."""
-    frame = seen(left).resize((96, 72), Image.Resampling.BOX).convert("L")
+    frame = shot(left).resize((96, 72), Image.Resampling.BOX).convert("L")
     about = (1 / scale, 0, 48 * (1 - 1 / scale), 0, 1 / scale, 36 * (1 - 1 / scale))
     frame = frame.transform((96, 72), Image.Transform.AFFINE, about, Image.Resampling.BICUBIC)
     return np.asarray(frame, np.float32)
@@ -75,8 +75,8 @@ def small(left: float, scale: float = 1.0) -> npt.NDArray[np.float32]:
 @pytest.mark.parametrize("pixels", [0.0, 0.3, 1.0, 3.0, 8.0, 16.0])
 def test_a_shift_is_measured_in_shares_of_the_longer_side(pixels: float) -> None:
     """To a tenth of a pixel while it is small. A sixth of the picture is found a fifth short: the window blurs it."""
-    found = 96 * flow.displacement(small(400), small(400 + pixels * WIDTH / 96))
-    assert found == pytest.approx(pixels, abs=0.1 if pixels < 10 else pixels / 5)
+    shift = 96 * flow.displacement(small(400), small(400 + pixels * WIDTH / 96))
+    assert shift == pytest.approx(pixels, abs=0.1 if pixels < 10 else pixels / 5)
 
 
 def test_going_forward_is_motion_too() -> None:
@@ -98,7 +98,7 @@ def test_frames_lie_at_equal_distances_where_the_camera_went_unevenly(tmp_path: 
     """It stands for 60 frames, goes fast for 30 and slowly for 60, and then stands again."""
     steps = [0.0] * 60 + [30.0] * 30 + [10.0] * 60 + [0.0] * 50
     lefts = np.cumsum(steps)
-    path = filmed(tmp_path / "walk.mp4", [seen(left) for left in lefts])
+    path = filmed(tmp_path / "walk.mp4", [shot(left) for left in lefts])
     taken = lefts[numbers(decoders.keyframes(path, tmp_path / "out", 40))]
     gaps = np.diff(taken)
     assert 32 <= len(taken) <= 40
@@ -110,7 +110,7 @@ def test_frames_lie_at_equal_distances_where_the_camera_went_unevenly(tmp_path: 
 
 def test_the_sharpest_of_neighbouring_frames_is_taken(tmp_path: Path) -> None:
     """Every fourth frame is sharp, the others are blurred along the way."""
-    frames = [seen(4.0 * number, 0.0 if number % 4 == 1 else 6.0) for number in range(120)]
+    frames = [shot(4.0 * number, 0.0 if number % 4 == 1 else 6.0) for number in range(120)]
     taken = numbers(decoders.keyframes(filmed(tmp_path / "walk.mp4", frames), tmp_path / "out", 15))
     assert 13 <= len(taken) <= 15
     assert all(number % 4 == 1 for number in taken)
@@ -119,7 +119,7 @@ def test_the_sharpest_of_neighbouring_frames_is_taken(tmp_path: Path) -> None:
 def test_a_camera_that_stands_gives_few_frames(tmp_path: Path) -> None:
     """What moves is the noise of the sensor. Before a turntable, too, most of the picture stands."""
     random = np.random.default_rng(0)
-    still = np.asarray(seen(300), float)
+    still = np.asarray(shot(300), float)
     frames = [
         Image.fromarray((still + random.normal(0, 3, still.shape)).clip(0, 255).astype(np.uint8))
         for _ in range(150)
@@ -131,7 +131,7 @@ def test_a_camera_that_stands_gives_few_frames(tmp_path: Path) -> None:
 def test_frames_come_in_order_under_their_numbers(tmp_path: Path) -> None:
     folder = tmp_path / "images"
     folder.mkdir()
-    filmed(folder / "walk.mp4", [seen(12.0 * number) for number in range(24)])
+    filmed(folder / "walk.mp4", [shot(12.0 * number) for number in range(24)])
     result = prepare(folder, None, tmp_path / "work", frames=100)
     names = [photo.name for photo in result.photos]
     assert names == sorted(names) == [f"walk_{number:06d}.jpg" for number in range(24)]
@@ -139,12 +139,12 @@ def test_frames_come_in_order_under_their_numbers(tmp_path: Path) -> None:
 
 
 def test_one_frame_is_enough(tmp_path: Path) -> None:
-    path = filmed(tmp_path / "blink.mp4", [seen(0)])
+    path = filmed(tmp_path / "blink.mp4", [shot(0)])
     assert numbers(decoders.keyframes(path, tmp_path / "out", 150)) == [0]
 
 
 def test_of_a_video_with_a_damaged_end_the_frames_before_it_are_used(tmp_path: Path) -> None:
-    whole = filmed(tmp_path / "whole.mkv", [seen(10.0 * number) for number in range(90)]).read_bytes()
+    whole = filmed(tmp_path / "whole.mkv", [shot(10.0 * number) for number in range(90)]).read_bytes()
     path = tmp_path / "cut.mkv"
     path.write_bytes(whole[: len(whole) * 2 // 3])
     taken = numbers(decoders.keyframes(path, tmp_path / "out", 20))
@@ -163,7 +163,7 @@ def turned(path: Path) -> Path:
         stream = container.add_stream("mjpeg", rate=30)
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuvj420p"
         for number in range(40):
-            frame = seen(10.0 * number)
+            frame = shot(10.0 * number)
             encoder = av.CodecContext.create("mjpeg", "w")
             encoder.width, encoder.height = frame.size if number < 20 else frame.size[::-1]
             encoder.pix_fmt, encoder.time_base = "yuvj420p", Fraction(1, 30)
@@ -176,13 +176,13 @@ def turned(path: Path) -> Path:
 
 
 def test_a_video_whose_frames_change_their_size_gives_frames_of_both(tmp_path: Path) -> None:
-    found = decoders.keyframes(turned(tmp_path / "walk.avi"), tmp_path / "out", 10)
-    assert len(found) == 10
-    assert {frame_size(path) for path in found} == {(WIDTH, HEIGHT), (HEIGHT, WIDTH)}
+    paths = decoders.keyframes(turned(tmp_path / "walk.avi"), tmp_path / "out", 10)
+    assert len(paths) == 10
+    assert {frame_size(path) for path in paths} == {(WIDTH, HEIGHT), (HEIGHT, WIDTH)}
 
 
 def test_reading_is_cancelled_in_both_passes(tmp_path: Path) -> None:
-    path = filmed(tmp_path / "walk.mp4", [seen(10.0 * number) for number in range(40)])
+    path = filmed(tmp_path / "walk.mp4", [shot(10.0 * number) for number in range(40)])
     for after in (5, 45):
         asked = iter(range(1000))
         with pytest.raises(Cancelled):

@@ -226,10 +226,10 @@ def test_highlights_rise_and_keep_their_hue(transfer: str) -> None:
     """Of a ramp of an orange of the scene up to the largest signal."""
     light = np.array([1.0, 0.6, 0.3]) * np.linspace(0.01, 3.7, 400)[:, None]
     signal = {"HLG": hlg, "PQ": pq}[transfer](light)
-    found = srgb(signal, Colors("sRGB", transfer))
-    assert (np.diff(found, axis=0) >= 0).all()
-    assert found.max() <= 1.0
-    shown = linear(found * 255)
+    rgb = srgb(signal, Colors("sRGB", transfer))
+    assert (np.diff(rgb, axis=0) >= 0).all()
+    assert rgb.max() <= 1.0
+    shown = linear(rgb * 255)
     assert np.allclose(shown[:, 1] / shown[:, 0], 0.6, atol=0.01)
     assert np.allclose(shown[:, 2] / shown[:, 0], 0.3, atol=0.01)
 
@@ -278,10 +278,10 @@ def test_pixels_are_made_square(aspect: str, size: tuple[int, int], container: s
         matrix=1,
         aspect=Fraction(aspect),
     )
-    found = first(path, tmp_path / "out")
-    assert found.shape[1::-1] == size
-    wanted = np.asarray(Image.fromarray(chart()).resize(size, Image.Resampling.LANCZOS), np.int64)
-    assert np.abs(found - wanted).mean() < 2.0
+    picture = first(path, tmp_path / "out")
+    assert picture.shape[1::-1] == size
+    expected = np.asarray(Image.fromarray(chart()).resize(size, Image.Resampling.LANCZOS), np.int64)
+    assert np.abs(picture - expected).mean() < 2.0
     assert [Fraction(aspect) == 1 or "not square" in said for said in decoders.video_remarks(path)] == [True]
 
 
@@ -346,11 +346,11 @@ def test_each_display_matrix_makes_frames_upright(
     path.write_bytes(data)
     x, y = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
     to_x, to_y = signs[0] * x + signs[2] * y, signs[1] * x + signs[3] * y
-    wanted = np.zeros((np.ptp(to_y) + 1, np.ptp(to_x) + 1, 3), np.int64)
-    wanted[to_y - to_y.min(), to_x - to_x.min()] = chart()
-    found = first(path, tmp_path / "out")
-    assert found.shape == wanted.shape
-    assert np.abs(found - wanted).mean() < 2.0
+    expected = np.zeros((np.ptp(to_y) + 1, np.ptp(to_x) + 1, 3), np.int64)
+    expected[to_y - to_y.min(), to_x - to_x.min()] = chart()
+    picture = first(path, tmp_path / "out")
+    assert picture.shape == expected.shape
+    assert np.abs(picture - expected).mean() < 2.0
     assert decoders.video_remarks(path) == []
 
 
@@ -368,9 +368,9 @@ def test_interlaced_frames_lose_every_second_line_and_not_their_shape(tmp_path: 
             plane.update(lines.tobytes())
         container.mux(stream.encode(frame))
         container.mux(stream.encode())
-    found = first(tmp_path / "a.mp4", tmp_path / "out")
-    assert found.shape == (HEIGHT, WIDTH, 3)
-    assert np.abs(found - chart()).mean() < 3.0
+    picture = first(tmp_path / "a.mp4", tmp_path / "out")
+    assert picture.shape == (HEIGHT, WIDTH, 3)
+    assert np.abs(picture - chart()).mean() < 3.0
     assert any("interlaced" in said for said in decoders.video_remarks(tmp_path / "a.mp4"))
 
 

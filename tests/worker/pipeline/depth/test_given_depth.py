@@ -65,20 +65,20 @@ def changed(capture: Path, change: Callable[[np.ndarray], np.ndarray], which: st
 def test_points_lie_on_the_surface(
     made: tuple[Path, dict[str, Camera]], scene: Scene, capture: Path, tmp_path: Path
 ) -> None:
-    found = read(scene, capture, tmp_path, ("00.png",))
-    own, used = len(scene.points), found.facts["depth_points_used"]
-    assert found.facts["depth_maps"] == len(scene.views) - 1  # none of a held-out photo
+    result = read(scene, capture, tmp_path, ("00.png",))
+    own, used = len(scene.points), result.facts["depth_points_used"]
+    assert result.facts["depth_maps"] == len(scene.views) - 1  # none of a held-out photo
     assert used > 5000
-    assert len(found.points) == own + used
-    errors = depth_sets.off_surface(found.points[own:], made[1])
+    assert len(result.points) == own + used
+    errors = depth_sets.off_surface(result.points[own:], made[1])
     assert np.quantile(errors, 0.5) < depth_sets.NOISE
     assert np.quantile(errors, 0.98) < 0.02
-    assert found.facts["depth_unit"] == 1e-3  # as the file says, and not as measured
-    assert found.facts["depth_unit_spread"] < 0.02
-    assert f"of which {used:,} are used: photos show their colours." in found.notes[-1]
-    assert found.warnings == scene.warnings
-    assert found.left_out == ()
-    assert found.point_views is None or len(found.point_views.offsets) == len(found.points) + 1
+    assert result.facts["depth_unit"] == 1e-3  # as the file says, and not as measured
+    assert result.facts["depth_unit_spread"] < 0.02
+    assert f"of which {used:,} are used: photos show their colours." in result.notes[-1]
+    assert result.warnings == scene.warnings
+    assert result.left_out == ()
+    assert result.point_views is None or len(result.point_views.offsets) == len(result.points) + 1
 
 
 def test_pixels_of_low_confidence_are_left_out(scene: Scene, capture: Path, tmp_path: Path) -> None:
@@ -123,19 +123,19 @@ def test_the_unit_is_measured_by_the_points_of_the_photos(
     length: float,
 ) -> None:
     changed(capture, change)
-    found = read(replace(scene, depth_unit=stated), capture, tmp_path)
-    assert found.facts["depth_unit"] == pytest.approx(length, rel=0.01)
-    assert found.facts["depth_points_used"] > 5000
-    assert ("the cameras say 0.001, which differs by a factor of 0.2" in found.notes[-1]) == bool(stated)
+    result = read(replace(scene, depth_unit=stated), capture, tmp_path)
+    assert result.facts["depth_unit"] == pytest.approx(length, rel=0.01)
+    assert result.facts["depth_points_used"] > 5000
+    assert ("the cameras say 0.001, which differs by a factor of 0.2" in result.notes[-1]) == bool(stated)
 
 
 def test_a_unit_that_cannot_be_told_is_refused_with_both_readings(
     scene: Scene, capture: Path, tmp_path: Path
 ) -> None:
     few = replace(scene, points=scene.points[:1], colors=scene.colors[:1], point_views=None, depth_unit=None)
-    found = read(few, capture, tmp_path)
-    assert len(found.points) == 1
-    said = found.warnings[-1]
+    result = read(few, capture, tmp_path)
+    assert len(result.points) == 1
+    said = result.warnings[-1]
     assert "their unit is not stated" in said
     assert " m (in millimetres) or " in said
     assert "as of TUM RGB-D" in said
@@ -148,16 +148,16 @@ def test_maps_of_other_photos_are_refused(scene: Scene, capture: Path, tmp_path:
     for path, other in zip(paths, levels[5:] + levels[:5], strict=True):
         path.write_bytes(other)
     shutil.rmtree(capture / "confidence")
-    found = read(scene, capture, tmp_path)
-    assert len(found.points) == len(scene.points)
-    assert "The depth maps are not used: they do not show the distances of the scene" in found.warnings[-1]
+    result = read(scene, capture, tmp_path)
+    assert len(result.points) == len(scene.points)
+    assert "The depth maps are not used: they do not show the distances of the scene" in result.warnings[-1]
 
 
 def test_inverse_depths_are_refused(scene: Scene, capture: Path, tmp_path: Path) -> None:
     changed(capture, lambda levels: np.where(levels > 0, 1e7 / np.maximum(levels, 200), 0).astype(np.uint16))
-    found = read(replace(scene, depth_unit=None), capture, tmp_path)
-    assert len(found.points) == len(scene.points)
-    assert "inverse or relative depths" in found.warnings[-1]
+    result = read(replace(scene, depth_unit=None), capture, tmp_path)
+    assert len(result.points) == len(scene.points)
+    assert "inverse or relative depths" in result.warnings[-1]
 
 
 def test_a_wrong_unit_without_points_is_refused_by_the_photos(
@@ -173,10 +173,10 @@ def test_a_wrong_unit_without_points_is_refused_by_the_photos(
 
 def test_one_map_of_another_photo_is_left_out(scene: Scene, capture: Path, tmp_path: Path) -> None:
     changed(capture, lambda levels: (0.6 * levels).astype(np.uint16), "03.png")
-    found = read(scene, capture, tmp_path)
-    assert found.facts["depth_maps"] == len(scene.views) - 1
-    assert "1 depth map is not used" in found.warnings[-1]
-    assert "of 03.png" in found.warnings[-1]
+    result = read(scene, capture, tmp_path)
+    assert result.facts["depth_maps"] == len(scene.views) - 1
+    assert "1 depth map is not used" in result.warnings[-1]
+    assert "of 03.png" in result.warnings[-1]
 
 
 def cut_off(path: Path) -> None:
@@ -208,17 +208,17 @@ def test_a_damaged_map_is_named(
     scene: Scene, capture: Path, tmp_path: Path, damage: Callable[[Path], Any], reason: str
 ) -> None:
     damage(capture / "depth" / "03.png")
-    found = read(scene, capture, tmp_path)
-    assert found.facts["depth_maps"] == len(scene.views) - 1
-    assert f"The depth map depth/03.png is not used: {reason}" in found.warnings[-1]
+    result = read(scene, capture, tmp_path)
+    assert result.facts["depth_maps"] == len(scene.views) - 1
+    assert f"The depth map depth/03.png is not used: {reason}" in result.warnings[-1]
     for path in (capture / "depth").iterdir():
         if path.name != "03.png":
             damage(path)
-    found = read(scene, capture, tmp_path)
-    assert len(found.points) == len(scene.points)
+    result = read(scene, capture, tmp_path)
+    assert len(result.points) == len(scene.points)
     assert (
         f"All {len(scene.views)} depth maps are not used, such as depth/00.png: {reason}"
-        in found.warnings[-1]
+        in result.warnings[-1]
     )
 
 
@@ -231,10 +231,10 @@ def test_floating_point_maps_with_holes_that_are_no_numbers(
         metres[:4] = np.inf
         Image.fromarray(metres).save(path.with_suffix(".tiff"))
         path.unlink()
-    found = read(replace(scene, depth_unit=None), capture, tmp_path)
-    assert found.facts["depth_unit"] == pytest.approx(1.0, rel=0.01)
-    errors = depth_sets.off_surface(found.points[len(scene.points) :], made[1])
-    assert np.isfinite(found.points).all()
+    result = read(replace(scene, depth_unit=None), capture, tmp_path)
+    assert result.facts["depth_unit"] == pytest.approx(1.0, rel=0.01)
+    errors = depth_sets.off_surface(result.points[len(scene.points) :], made[1])
+    assert np.isfinite(result.points).all()
     assert np.quantile(errors, 0.98) < 0.02
 
 
@@ -248,16 +248,16 @@ def test_maps_that_frames_name_lie_in_any_folder(
     (capture / "transforms.json").write_text(json.dumps(document))
     scene = posed_scene(capture, tmp_path / "work", TrainOptions(), lambda *_: None, lambda: False)
     assert scene.depth_unit == 1e-3
-    found = read(scene, capture, tmp_path)
-    assert found.facts["depth_maps"] == len(scene.views)
-    assert found.left_out == ()
+    result = read(scene, capture, tmp_path)
+    assert result.facts["depth_maps"] == len(scene.views)
+    assert result.left_out == ()
 
 
 def test_maps_that_belong_to_no_photo_are_named(scene: Scene, capture: Path, tmp_path: Path) -> None:
     for path in (capture / "depth").iterdir():
         path.rename(path.with_name(f"frame_{path.name}"))
-    found = read(scene, capture, tmp_path)
-    assert "14 depth maps (such as depth/frame_00.png) belong to no photo by name" in found.warnings[-1]
+    result = read(scene, capture, tmp_path)
+    assert "14 depth maps (such as depth/frame_00.png) belong to no photo by name" in result.warnings[-1]
 
 
 def test_recovered_cameras_get_the_metres_of_a_phone(
@@ -269,14 +269,14 @@ def test_recovered_cameras_get_the_metres_of_a_phone(
     recovered = replace(
         turn.apply(scene), source="sfm", frame=frame, depth_unit=None, notes=("It is arbitrary.",)
     )
-    found = read(recovered, capture, tmp_path)
-    assert found.frame is not None
-    assert found.frame.unit == "metre"
-    assert "millimetres" in found.frame.reasons["unit"]
-    assert found.notes[0] == found.frame.reasons["unit"]
+    result = read(recovered, capture, tmp_path)
+    assert result.frame is not None
+    assert result.frame.unit == "metre"
+    assert "millimetres" in result.frame.reasons["unit"]
+    assert result.notes[0] == result.frame.reasons["unit"]
     true = [np.linalg.norm(view.camera.center) for view in scene.views]
     middle = turn.points(np.zeros((1, 3)))[0] / 0.4
-    there = [np.linalg.norm(view.camera.center - middle) for view in found.views]
+    there = [np.linalg.norm(view.camera.center - middle) for view in result.views]
     np.testing.assert_allclose(there, true, rtol=0.01)
 
 

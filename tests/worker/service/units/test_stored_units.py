@@ -24,8 +24,8 @@ SCENE = ScenePlan("digest", TrainOptions(tiles=2))
 
 @pytest.fixture(params=["local", "remote"])
 def storage(request: pytest.FixtureRequest) -> Storage:
-    found: Storage = request.getfixturevalue(request.param)
-    return found
+    store: Storage = request.getfixturevalue(request.param)
+    return store
 
 
 @pytest.fixture
@@ -55,8 +55,8 @@ def test_outputs_for_which_there_is_no_room_are_not_brought(
 ) -> None:
     units, asked = StoredUnits(storage, JOB), list[int]()
 
-    def refuse(wanted: Mapping[Path, Entry]) -> None:
-        asked.append(sum(entry.size for entry in wanted.values()))
+    def refuse(files: Mapping[Path, Entry]) -> None:
+        asked.append(sum(entry.size for entry in files.values()))
         raise OSError("full")
 
     units.put(here.output("cameras"))

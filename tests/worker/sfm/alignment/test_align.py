@@ -31,9 +31,9 @@ def moved(seed: int, scale: float = 1.0, offset: Float = UTM) -> Similarity:
     return Similarity(rotation * np.sign(np.linalg.det(rotation)), scale, offset)
 
 
-def error(found: Aligned, truth: Similarity, points: Float) -> float:
+def error(alignment: Aligned, truth: Similarity, points: Float) -> float:
     """Median distance of the points from where they belong, once moved there and back."""
-    apart = found.similarity.points(truth.points(points)) - points
+    apart = alignment.similarity.points(truth.points(points)) - points
     return float(np.median(np.linalg.norm(apart, axis=1)))
 
 
@@ -43,18 +43,18 @@ def test_a_scan_in_any_unit_and_place_is_brought_back(seed: int, scale: float) -
     truth = moved(seed, scale)
     own = still_life.scene()
     told: list[tuple[str, int, int, str]] = []
-    found = align(
+    alignment = align(
         truth.points(points), colors, own.points, own.colors, on_progress=lambda *report: told.append(report)
     )
-    assert isinstance(found, Aligned)
+    assert isinstance(alignment, Aligned)
     # Points of the scene have a median distance of 1.6 from their middle.
-    assert error(found, truth, own.points) < 0.01
+    assert error(alignment, truth, own.points) < 0.01
     assert [report[:2] for report in told] == [("alignment", done) for done in range(len(told))]
     assert 0 < len(told) <= told[0][2]
-    assert found.similarity.scale * scale == pytest.approx(1.0, rel=0.005)
-    assert found.share > 0.5
+    assert alignment.similarity.scale * scale == pytest.approx(1.0, rel=0.005)
+    assert alignment.share > 0.5
     # Noise of 0.004 and the planes through points that are 0.03 apart.
-    assert 0.001 < found.residual / scale < 0.03
+    assert 0.001 < alignment.residual / scale < 0.03
 
 
 def test_duplicates_change_nothing_about_the_place() -> None:
@@ -62,9 +62,9 @@ def test_duplicates_change_nothing_about_the_place() -> None:
     truth = moved(4, 3.0)
     own = still_life.scene()
     twice = np.concatenate([truth.points(points)] * 2)
-    found = align(twice, np.concatenate([colors] * 2), own.points, own.colors)
-    assert isinstance(found, Aligned)
-    assert error(found, truth, own.points) < 0.01
+    alignment = align(twice, np.concatenate([colors] * 2), own.points, own.colors)
+    assert isinstance(alignment, Aligned)
+    assert error(alignment, truth, own.points) < 0.01
 
 
 def test_a_point_at_the_end_of_the_world_changes_nothing() -> None:
@@ -72,9 +72,9 @@ def test_a_point_at_the_end_of_the_world_changes_nothing() -> None:
     own = still_life.scene()
     points, colors = points.copy(), colors.copy()
     points[7] = 1e200
-    found = align(points, colors, own.points, own.colors)
-    assert isinstance(found, Aligned)
-    assert error(found, Similarity(np.eye(3), 1.0, np.zeros(3)), own.points) < 0.01
+    alignment = align(points, colors, own.points, own.colors)
+    assert isinstance(alignment, Aligned)
+    assert error(alignment, Similarity(np.eye(3), 1.0, np.zeros(3)), own.points) < 0.01
 
 
 def test_a_scan_of_a_part_of_the_scene_is_brought_back() -> None:
@@ -83,11 +83,11 @@ def test_a_scan_of_a_part_of_the_scene_is_brought_back() -> None:
     part = near < np.quantile(near, 0.15)
     truth = moved(5, 7.0)
     own = still_life.scene()
-    found = align(truth.points(points[part]), colors[part], own.points, own.colors)
-    assert isinstance(found, Aligned)
+    alignment = align(truth.points(points[part]), colors[part], own.points, own.colors)
+    assert isinstance(alignment, Aligned)
     there = np.linalg.norm(own.points - np.array([0.0, 0.0, 0.4]), axis=1) < near[part].max()
     assert there.mean() < 0.4
-    assert error(found, truth, own.points[there]) < 0.05
+    assert error(alignment, truth, own.points[there]) < 0.05
 
 
 def test_a_scan_of_a_house_around_the_scene_is_brought_back() -> None:
@@ -100,14 +100,14 @@ def test_a_scan_of_a_house_around_the_scene_is_brought_back() -> None:
     patches = paint[np.abs((walls // 2).astype(int) @ np.array([1, 20, 400])) % 300].astype(np.uint8)
     truth = moved(6, 1.0)
     own = still_life.scene()
-    found = align(
+    alignment = align(
         truth.points(np.concatenate([points, walls])),
         np.concatenate([colors, patches]),
         own.points,
         own.colors,
     )
-    assert isinstance(found, Aligned)
-    assert error(found, truth, own.points) < 0.1
+    assert isinstance(alignment, Aligned)
+    assert error(alignment, truth, own.points) < 0.1
 
 
 def line(count: int) -> Float:
@@ -124,14 +124,14 @@ def line(count: int) -> Float:
 )
 def test_points_that_determine_no_similarity_are_named(points: Float, reason: str) -> None:
     own = still_life.scene()
-    found = align(points, np.full((len(points), 3), 90, np.uint8), own.points, own.colors)
-    assert found == Unaligned(f"of the file, {reason}")
+    outcome = align(points, np.full((len(points), 3), 90, np.uint8), own.points, own.colors)
+    assert outcome == Unaligned(f"of the file, {reason}")
 
 
 def test_a_scene_without_points_is_named() -> None:
     points, colors = scanned()
-    found = align(points, colors, np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
-    assert found == Unaligned("of the cloud of the photos, it has 0 distinct points")
+    outcome = align(points, colors, np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+    assert outcome == Unaligned("of the cloud of the photos, it has 0 distinct points")
 
 
 def test_a_scan_of_a_plane_alone_is_brought_back() -> None:
@@ -140,9 +140,9 @@ def test_a_scan_of_a_plane_alone_is_brought_back() -> None:
     plane = points[flat] * [1, 1, 0] + [0, 0, np.median(points[:, 2])]
     truth = moved(7, 2.0, np.zeros(3))
     own = still_life.scene()
-    found = align(truth.points(plane), colors[flat], own.points, own.colors)
-    if isinstance(found, Aligned):
-        assert error(found, truth, plane) < 0.05
+    outcome = align(truth.points(plane), colors[flat], own.points, own.colors)
+    if isinstance(outcome, Aligned):
+        assert error(outcome, truth, plane) < 0.05
 
 
 def test_the_same_scan_gives_the_same_similarity() -> None:
@@ -159,9 +159,9 @@ def test_places_that_fit_equally_well_are_told_apart() -> None:
     points, colors = scanned()[0][::40], scanned()[1][::40]
     own = still_life.scene()
     exchanged = np.random.default_rng(1).permutation(len(colors))
-    found = align(points, colors[exchanged], own.points[::20], own.colors[::20])
-    assert isinstance(found, Aligned)
-    assert found.share < 0.5
+    alignment = align(points, colors[exchanged], own.points[::20], own.colors[::20])
+    assert isinstance(alignment, Aligned)
+    assert alignment.share < 0.5
 
 
 def test_cells_hold_one_point_each() -> None:

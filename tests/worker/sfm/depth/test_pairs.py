@@ -21,14 +21,14 @@ def paired(root: Path, photos: str, maps: str) -> dict[str, tuple[str | None, st
         (root / name).parent.mkdir(parents=True, exist_ok=True)
         (root / name).write_bytes(b"x")
     views = [view(root / name) for name in photos.split()]
-    found = pairs.found([root], views)
+    depth_maps = pairs.maps_of([root], views)
 
     def called(path: Path | None) -> str | None:
         return None if path is None else path.relative_to(root).as_posix()
 
     return {
         views[index].image.relative_to(root).as_posix(): (called(depth), called(sure))
-        for index, (depth, sure) in found.of_view.items()
+        for index, (depth, sure) in depth_maps.of_view.items()
     }
 
 
@@ -77,6 +77,6 @@ def test_maps_belong_to_photos_by_name(
 
 def test_maps_that_belong_to_none_are_named(tmp_path: Path) -> None:
     paired(tmp_path, "", "depth/a.png depth/b.png confidence/a.png")
-    found = pairs.found([tmp_path], [view(tmp_path / "a.jpg")])
-    assert found.unpaired == ("depth/b.png",)
-    assert found.names == {"depth/a.png", "depth/b.png", "confidence/a.png"}
+    maps = pairs.maps_of([tmp_path], [view(tmp_path / "a.jpg")])
+    assert maps.unpaired == ("depth/b.png",)
+    assert maps.names == {"depth/a.png", "depth/b.png", "confidence/a.png"}

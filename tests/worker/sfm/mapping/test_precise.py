@@ -25,7 +25,7 @@ SMALL, LARGE = 1.0, 8.0
 """Scales of features, in pixels."""
 
 
-def seen(model: pycolmap.Reconstruction, image: int) -> list[int]:
+def with_points(model: pycolmap.Reconstruction, image: int) -> list[int]:
     return [number for number, point in enumerate(model.images[image].points2D) if point.has_point3D()]
 
 
@@ -69,7 +69,7 @@ def test_large_features_that_bend_the_lens_are_left_out_and_their_points_follow_
     observations = model.compute_num_observations()
     small = without_large_features(model, scales)
     assert small is not None
-    kept = sum(int((scales[image][seen(model, image)] == SMALL).sum()) for image in scales)
+    kept = sum(int((scales[image][with_points(model, image)] == SMALL).sum()) for image in scales)
     assert small.compute_num_observations() == kept < 0.7 * observations
     assert model.compute_num_observations() == observations
     all_of_them = copy.deepcopy(model)
@@ -109,13 +109,13 @@ def test_a_photo_without_small_features_keeps_the_smallest_ones() -> None:
     scales[blurred] = rng.uniform(LARGE, 2 * LARGE, len(scales[blurred])).astype(np.float32)
     small = without_large_features(model, scales)
     assert small is not None
-    before, after = (scales[blurred][seen(each, blurred)] for each in (model, small))
+    before, after = (scales[blurred][with_points(each, blurred)] for each in (model, small))
     smallest = np.sort(before)[:KEPT_OBSERVATIONS]
     assert len(before) > 1.5 * KEPT_OBSERVATIONS
     assert sorted(after) == smallest.tolist()
     # Of points that only large features show, the other photos keep what the blurred one needs.
     large = {point for point in small.points3D if point <= 0.4 * POINTS}
-    needed = {small.images[blurred].points2D[number].point3D_id for number in seen(small, blurred)}
+    needed = {small.images[blurred].points2D[number].point3D_id for number in with_points(small, blurred)}
     assert large
     assert large <= needed
     assert all(
@@ -132,8 +132,8 @@ def test_the_limit_makes_the_variance_of_what_is_estimated_smallest() -> None:
     }
     rows = []
     for image, sizes in scales.items():
-        ranks = np.argsort(np.argsort(sizes[seen(model, image)]))
-        for number, rank in zip(seen(model, image), ranks, strict=True):
+        ranks = np.argsort(np.argsort(sizes[with_points(model, image)]))
+        for number, rank in zip(with_points(model, image), ranks, strict=True):
             point = model.images[image].points2D[number]
             point.xy = point.xy + rng.normal(0, 0.3 * sizes[number], 2)
             shown = model.images[image].project_point(model.points3D[point.point3D_id].xyz)

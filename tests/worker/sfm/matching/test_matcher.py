@@ -22,7 +22,7 @@ def test_matches_are_the_mutual_nearest_that_pass_the_ratio_test() -> None:
     noise = np.random.default_rng(3).integers(-12, 13, (200, 128))
     b.descriptors[100:300] = np.clip(a.descriptors[:200].astype(int) + noise, 0, 255)
     b.descriptors[300:310] = b.descriptors[100:110]  # ten ambiguous ones
-    found = {tuple(row) for row in Matcher([a, b]).match(0, 1).tolist()}
+    matches = {tuple(row) for row in Matcher([a, b]).match(0, 1).tolist()}
     unit = [
         f.descriptors / np.linalg.norm(f.descriptors.astype(float), axis=1, keepdims=True) for f in (a, b)
     ]
@@ -34,8 +34,8 @@ def test_matches_are_the_mutual_nearest_that_pass_the_ratio_test() -> None:
             MAX_ANGLE, MAX_RATIO * angles[row, second]
         ):
             expected.add((row, int(first)))
-    assert found == expected
-    assert found == {(k, 100 + k) for k in range(10, 200)}
+    assert matches == expected
+    assert matches == {(k, 100 + k) for k in range(10, 200)}
 
 
 def test_descriptors_that_are_kept_stay_within_their_bound() -> None:

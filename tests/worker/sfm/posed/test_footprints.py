@@ -76,5 +76,5 @@ def test_a_wall_hides_what_lies_behind_it() -> None:
 def test_a_slanted_surface_does_not_hide_itself() -> None:
     points = wall(2.0, 4000)
     points[:, 2] += points[:, 0]  # 45 degrees
-    seen = CAMERA.project(points)
-    assert len(visible(CAMERA, seen)) == seen.inside.sum()
+    projection = CAMERA.project(points)
+    assert len(visible(CAMERA, projection)) == projection.inside.sum()

@@ -20,7 +20,7 @@ ALL = {name: k for k, name in enumerate(NAMES)}
 PIXELS = {"w": 64, "h": 48, "fl_x": 60, "fl_y": 61, "cx": 32, "cy": 24}
 
 
-def given(root: Path, **fields: Any) -> Path:
+def capture(root: Path, **fields: Any) -> Path:
     photos(root / "images")
     (root / "transforms.json").write_text(json.dumps({**fields, "frames": frames()}))
     return root
@@ -37,14 +37,14 @@ def given(root: Path, **fields: Any) -> Path:
 )
 def test_parts_of_the_sides_are_refused(tmp_path: Path, fields: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="64 x 48 pixels; intrinsics are in pixels"):
-        loaded(given(tmp_path, **{**PIXELS, **fields}))
+        loaded(capture(tmp_path, **{**PIXELS, **fields}))
 
 
 @pytest.mark.parametrize("degrees", [35.0, 56.1, 90.0, 400.0])
 @pytest.mark.parametrize("field", ["camera_angle_x", "camera_angle_y"])
 def test_an_angle_in_degrees_is_refused_with_the_radians(tmp_path: Path, degrees: float, field: str) -> None:
     with pytest.raises(ValueError, match=f"{field} is {degrees:g}; .* give {math.radians(degrees):.6g}"):
-        loaded(given(tmp_path, **{field: degrees}))
+        loaded(capture(tmp_path, **{field: degrees}))
 
 
 @pytest.mark.parametrize(
@@ -69,4 +69,4 @@ def test_a_colmap_model_is_checked_too(tmp_path: Path, line: str) -> None:
     [{"cx": 2.0, "cy": 1.5}, {"cx": -9, "cy": 0}, {"fl_x": 8, "fl_y": 8}, {"fl_x": 9000, "fl_y": 9000}],
 )
 def test_unusual_intrinsics_in_pixels_are_used(tmp_path: Path, fields: dict[str, Any]) -> None:
-    check(loaded(given(tmp_path, **{**PIXELS, **fields})), ALL)
+    check(loaded(capture(tmp_path, **{**PIXELS, **fields})), ALL)

@@ -55,9 +55,9 @@ def test_a_capture_with_a_model_without_points_has_cameras(tmp_path: Path) -> No
     (tmp_path / "poses/points3D.txt").unlink()
     for number in range(3):
         write(tmp_path / "images" / f"{number + 1}.jpg", pictures.photo(number))
-    found = posed.find(tmp_path)
-    assert found is not None
-    scene = found.load()
+    poses = posed.find(tmp_path)
+    assert poses is not None
+    scene = poses.load()
     assert [view.name for view in scene.views] == ["1.jpg", "2.jpg", "3.jpg"]
     assert scene.points.shape == (0, 3)
 
@@ -96,14 +96,14 @@ def test_small_files_do_not_become_large(tmp_path: Path) -> None:
             tmp_path / "features", images="1 1 0 0 0 1 0 5 1 1.jpg\n" + "0 0 -1 " * 5_000_000 + "\n"
         ),
     }
-    found = dict(zip(list(folders)[1:], peaks(READ, list(folders.values())), strict=True))
-    assert found["points"][1] == "read"
-    assert found["points"][0] < colmap_files.COPIES * (folders["points"] / "points3D.txt").stat().st_size
-    assert "more than 200000 cameras" in found["cameras"][1]
-    assert "more than 200000 images" in found["images"][1]
-    assert "line 1 has 1048576 bytes or more" in found["track"][1]
-    assert found["features"][1] == "read"
-    assert all(size < 200 * 10**6 for size, _ in found.values()), found
+    outcomes = dict(zip(list(folders)[1:], peaks(READ, list(folders.values())), strict=True))
+    assert outcomes["points"][1] == "read"
+    assert outcomes["points"][0] < colmap_files.COPIES * (folders["points"] / "points3D.txt").stat().st_size
+    assert "more than 200000 cameras" in outcomes["cameras"][1]
+    assert "more than 200000 images" in outcomes["images"][1]
+    assert "line 1 has 1048576 bytes or more" in outcomes["track"][1]
+    assert outcomes["features"][1] == "read"
+    assert all(size < 200 * 10**6 for size, _ in outcomes.values()), outcomes
 
 
 def parsed(path: Path) -> None:

@@ -66,9 +66,9 @@ def capture(
             lens |= {"w": camera.width, "h": camera.height, "cx": camera.cx, "cy": camera.cy}
         frames.append(frame_of(f"{index}.png", camera.viewmat, **lens))
     (folder / "transforms.json").write_text(json.dumps({"frames": frames}))
-    given = posed.find(folder)
-    assert given is not None
-    return given.load()
+    poses = posed.find(folder)
+    assert poses is not None
+    return poses.load()
 
 
 def check(scene: Scene, size: tuple[int, int]) -> None:
@@ -149,11 +149,11 @@ def test_points_keep_their_other_tracks_where_a_photo_is_left_out(tmp_path: Path
         exif = Image.Exif()
         exif[0x0112] = 3 if name == names[1] else 1
         Image.new("RGB", size).save(tmp_path / "images" / name, exif=exif)
-    given = posed.find(tmp_path)
-    assert given is not None
-    scene = orientation.decided(given.load())
+    poses = posed.find(tmp_path)
+    assert poses is not None
+    scene = orientation.decided(poses.load())
     (tmp_path / "images" / names[1]).unlink()
-    expected = given.load()
+    expected = poses.load()
     assert [view.name for view in scene.views] == [view.name for view in expected.views]
     np.testing.assert_array_equal(scene.points, expected.points)
     assert scene.point_views is not None
@@ -170,10 +170,10 @@ def test_points_behind_the_cameras_show_that_all_photos_are_upside_down(tmp_path
         Camera(200, 200, 150.0, 150.0, 100.0, 100.0, viewmat_of(np.eye(3), np.array([x, 0, 0])))
         for x in (0, 1)
     ]
-    seen = [np.stack(camera.project(points)[:2], axis=1) for camera in cameras]
+    projections = [np.stack(camera.project(points)[:2], axis=1) for camera in cameras]
     matches = np.repeat(np.arange(40, dtype=np.uint32)[:, None], 2, axis=1)
-    found = []
-    for name, places in (("right", seen), ("upside down", [200.0 - place for place in seen])):
+    errors = []
+    for name, places in (("right", projections), ("upside down", [200.0 - place for place in projections])):
         features = [
             Features(place, np.ones(40, np.float32), np.zeros((40, 128), np.uint8)) for place in places
         ]
@@ -181,13 +181,13 @@ def test_points_behind_the_cameras_show_that_all_photos_are_upside_down(tmp_path
         geometry = pycolmap.TwoViewGeometry()
         geometry.inlier_matches = matches
         database.write_two_view_geometry(1, 2, geometry)
-        found.append(
+        errors.append(
             [
                 epipolar_errors([(0, 1)], cameras, features, database, in_front=front)
                 for front in (False, True)
             ]
         )
         database.close()
-    (plain, front), (turned_plain, turned_front) = found
+    (plain, front), (turned_plain, turned_front) = errors
     assert max(plain.max(), front.max(), turned_plain.max()) < 1e-9
     assert np.isinf(turned_front).all()

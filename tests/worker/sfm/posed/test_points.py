@@ -59,20 +59,20 @@ def bare(photos: tuple[Path, Truth]) -> Scene:
 
 
 @pytest.fixture(scope="module")
-def found(bare: Scene) -> Triangulated:
+def triangulation(bare: Scene) -> Triangulated:
     return triangulate(bare.views, LEAN)
 
 
 @pytest.fixture(scope="module")
 def shown() -> Shown:
     """What a camera sees, which is computed once for all tests."""
-    seen: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
+    pictures: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
 
     def see(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
         place = camera.viewmat.tobytes()
-        if place not in seen:
-            seen[place] = synthetic.photograph(synthetic.still_life(), camera, samples=1)
-        return seen[place]
+        if place not in pictures:
+            pictures[place] = synthetic.photograph(synthetic.still_life(), camera, samples=1)
+        return pictures[place]
 
     return see
 
@@ -82,32 +82,34 @@ def depth_errors(scene: Scene, points: np.ndarray, shown_by: np.ndarray, shown: 
     errors = []
     for index in np.unique(shown_by):
         camera = scene.views[index].camera
-        seen = camera.project(points[shown_by == index])
+        projection = camera.project(points[shown_by == index])
         _, depth = shown(camera)
-        rows = np.clip(seen.rows.astype(int)[:, None] + np.repeat([-1, 0, 1], 3), 0, HEIGHT - 1)
-        columns = np.clip(seen.columns.astype(int)[:, None] + np.tile([-1, 0, 1], 3), 0, WIDTH - 1)
-        errors.append(np.abs(depth[rows, columns] / seen.depths[:, None] - 1.0).min(axis=1))
+        rows = np.clip(projection.rows.astype(int)[:, None] + np.repeat([-1, 0, 1], 3), 0, HEIGHT - 1)
+        columns = np.clip(projection.columns.astype(int)[:, None] + np.tile([-1, 0, 1], 3), 0, WIDTH - 1)
+        errors.append(np.abs(depth[rows, columns] / projection.depths[:, None] - 1.0).min(axis=1))
     return np.concatenate(errors)
 
 
-def test_triangulated_points_lie_on_the_surfaces(bare: Scene, found: Triangulated, shown: Shown) -> None:
-    assert len(found.points) > 200
-    first = np.array([track[0] for track in found.tracks])
-    errors = depth_errors(bare, found.points, first, shown)
+def test_triangulated_points_lie_on_the_surfaces(
+    bare: Scene, triangulation: Triangulated, shown: Shown
+) -> None:
+    assert len(triangulation.points) > 200
+    first = np.array([track[0] for track in triangulation.tracks])
+    errors = depth_errors(bare, triangulation.points, first, shown)
     assert np.median(errors) < 0.005
     assert np.mean(errors < 0.03) > 0.9
-    assert found.agreeing > 0.9 * found.matches
-    assert found.disagreement < 0.5
-    assert min(map(len, found.tracks)) >= 3
+    assert triangulation.agreeing > 0.9 * triangulation.matches
+    assert triangulation.disagreement < 0.5
+    assert min(map(len, triangulation.tracks)) >= 3
 
 
-def test_colours_are_those_of_the_photos(bare: Scene, found: Triangulated) -> None:
-    most = np.bincount([index for track in found.tracks for index in track]).argmax()
-    own = [row for row, track in enumerate(found.tracks) if most in track]
-    seen = bare.views[most].camera.project(found.points[own])
+def test_colours_are_those_of_the_photos(bare: Scene, triangulation: Triangulated) -> None:
+    most = np.bincount([index for track in triangulation.tracks for index in track]).argmax()
+    own = [row for row, track in enumerate(triangulation.tracks) if most in track]
+    projection = bare.views[most].camera.project(triangulation.points[own])
     photo = np.asarray(Image.open(bare.views[most].image)).astype(float)
-    there = photo[seen.rows.astype(int), seen.columns.astype(int)]
-    assert np.median(np.abs(there - found.colors[own])) < 15
+    there = photo[projection.rows.astype(int), projection.columns.astype(int)]
+    assert np.median(np.abs(there - triangulation.colors[own])) < 15
 
 
 def transforms(truth: Truth, names: list[str]) -> str:
@@ -233,9 +235,9 @@ def test_a_colmap_model_keeps_points_that_have_no_track(photos: tuple[Path, Trut
     for xyz in np.random.default_rng(0).normal(0.0, 0.3, (50, 3)):
         model.add_point3D(xyz, pycolmap.Track(), np.array([10, 20, 30], np.uint8))
     model.write_text(tmp_path / "poses")
-    given = posed.find(tmp_path)
-    assert given is not None
-    scene = given.load()
+    poses = posed.find(tmp_path)
+    assert poses is not None
+    scene = poses.load()
     assert len(scene.points) == 50
     assert scene.point_views is None
 
@@ -270,19 +272,19 @@ def test_points_with_tracks_are_checked_in_the_photos_that_the_tracks_name(
     enough: bool, shift: int, bare: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Few points bring a search for more, which shows it as well."""
-    given = posed.with_points(replace(bare, views=bare.views[:10]), tmp_path)
-    assert given.point_views is not None
+    scene = posed.with_points(replace(bare, views=bare.views[:10]), tmp_path)
+    assert scene.point_views is not None
     monkeypatch.setattr(points, "_lacks_points", lambda _: not enough)
-    assert posed.with_points(given, tmp_path / "right").warnings == ()
-    files = [view.image for view in given.views]
+    assert posed.with_points(scene, tmp_path / "right").warnings == ()
+    files = [view.image for view in scene.views]
     exchanged = tuple(
-        replace(view, image=files[(index + shift) % len(files)]) for index, view in enumerate(given.views)
+        replace(view, image=files[(index + shift) % len(files)]) for index, view in enumerate(scene.views)
     )
-    wrong = posed.with_points(replace(given, views=exchanged), tmp_path / "wrong")
+    wrong = posed.with_points(replace(scene, views=exchanged), tmp_path / "wrong")
     [warning] = wrong.warnings
     assert warning.startswith("The given cameras explain only")
     assert "belong to other photos" in warning
-    assert len(wrong.points) >= len(given.points)
+    assert len(wrong.points) >= len(scene.points)
 
 
 def test_cameras_that_are_all_in_one_place_explain_only_what_their_turn_does(bare: Scene) -> None:
@@ -291,9 +293,9 @@ def test_cameras_that_are_all_in_one_place_explain_only_what_their_turn_does(bar
 
     place = bare.views[0].camera.center
     views = [at(view, view.camera.viewmat[:3, :3], place) for view in bare.views[:5]]
-    found = triangulate(views, LEAN)
-    assert found.matches > 0
-    assert found.agreeing < 0.5 * found.matches
+    result = triangulate(views, LEAN)
+    assert result.matches > 0
+    assert result.agreeing < 0.5 * result.matches
 
 
 @pytest.mark.parametrize(
@@ -317,10 +319,10 @@ def test_another_convention_of_matrices_is_suggested(
         replace(view, camera=replace(view.camera, viewmat=misread(view.camera.viewmat)))
         for view in bare.views[:5]
     ]
-    found = triangulate(views, LEAN, source=source)
-    assert found.agreeing < 0.5 * found.matches
-    assert found.convention == named
-    assert (found.convention_share > 0.8) == bool(named)
+    result = triangulate(views, LEAN, source=source)
+    assert result.agreeing < 0.5 * result.matches
+    assert result.convention == named
+    assert (result.convention_share > 0.8) == bool(named)
 
 
 def test_a_wrong_focal_length_is_named(bare: Scene, tmp_path: Path) -> None:
@@ -333,7 +335,9 @@ def test_a_wrong_focal_length_is_named(bare: Scene, tmp_path: Path) -> None:
     assert scene.facts["matches_explained_by_cameras"] < 0.5
 
 
-def test_small_errors_of_the_cameras_are_measured(bare: Scene, found: Triangulated, tmp_path: Path) -> None:
+def test_small_errors_of_the_cameras_are_measured(
+    bare: Scene, triangulation: Triangulated, tmp_path: Path
+) -> None:
     random = np.random.default_rng(0)
     views = []
     for view in bare.views:
@@ -342,7 +346,7 @@ def test_small_errors_of_the_cameras_are_measured(bare: Scene, found: Triangulat
         views.append(replace(view, camera=replace(view.camera, viewmat=viewmat_of(rotation, center))))
     scene = posed.with_points(replace(bare, views=tuple(views)), tmp_path)
     assert scene.facts["triangulated_points"] > 150
-    assert scene.facts["match_error_px"] > 1.5 * found.disagreement
+    assert scene.facts["match_error_px"] > 1.5 * triangulation.disagreement
 
 
 def test_two_photos_give_points(bare: Scene, tmp_path: Path) -> None:
@@ -385,10 +389,13 @@ def share_outside(scene: Scene, points: np.ndarray) -> float:
     """Share of the places, over all photos, where a point falls on transparent pixels and has none else around it."""
     outside = total = 0
     for view in scene.views:
-        seen = view.camera.project(points)
+        projection = view.camera.project(points)
         alpha = np.asarray(Image.open(view.image))[:, :, 3]
         near = np.max([np.roll(alpha, (a, b), (0, 1)) for a in (-1, 0, 1) for b in (-1, 0, 1)], axis=0)
-        rows, columns = seen.rows[seen.inside].astype(int), seen.columns[seen.inside].astype(int)
+        rows, columns = (
+            projection.rows[projection.inside].astype(int),
+            projection.columns[projection.inside].astype(int),
+        )
         outside += int((near[rows, columns] == 0).sum())
         total += len(rows)
     return outside / total
@@ -425,10 +432,10 @@ def test_given_points_outside_the_outlines_of_transparent_photos_are_left_out(
 ) -> None:
     cut = cut_out(bare, shown, tmp_path)
     points, colors = surface_points(bare, 8000, shown)
-    given = posed.with_points(replace(cut, points=points, colors=colors), tmp_path / "work")
-    assert 100 < given.facts["loose_points_used"] < 8000
-    assert "lie where a photo is transparent" in given.notes[0]
-    assert share_outside(cut, given.points) == 0.0
+    scene = posed.with_points(replace(cut, points=points, colors=colors), tmp_path / "work")
+    assert 100 < scene.facts["loose_points_used"] < 8000
+    assert "lie where a photo is transparent" in scene.notes[0]
+    assert share_outside(cut, scene.points) == 0.0
 
 
 def test_other_lenses_points_and_masks_are_stored_apart(bare: Scene, tmp_path: Path) -> None:

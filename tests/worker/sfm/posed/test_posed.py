@@ -55,14 +55,14 @@ def test_transforms_become_opencv_world_to_camera(tmp_path: Path) -> None:
     write_transforms(
         tmp_path / "poses/transforms.json", [frame], fl_x=60.0, fl_y=61.0, cx=31.0, cy=25.0, w=64, h=48
     )
-    found = posed.find(tmp_path)
-    assert found is not None
-    scene = found.load()
+    poses = posed.find(tmp_path)
+    assert poses is not None
+    scene = poses.load()
     assert scene.source == "transforms"
     camera = scene.views[0].camera
     np.testing.assert_allclose(camera.center, [1.0, 2.0, 3.0], atol=1e-12)
-    seen = camera.viewmat @ np.array([1.0, 2.5, -1.0, 1.0])  # 4 ahead, 0.5 up
-    np.testing.assert_allclose(seen[:3], [0.0, -0.5, 4.0], atol=1e-12)
+    local = camera.viewmat @ np.array([1.0, 2.5, -1.0, 1.0])  # 4 ahead, 0.5 up
+    np.testing.assert_allclose(local[:3], [0.0, -0.5, 4.0], atol=1e-12)
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (60.0, 61.0, 31.0, 25.0)
     assert scene.views[0].lens is None
 
@@ -73,9 +73,9 @@ def test_distortion_and_the_size_of_the_files_are_honoured(tmp_path: Path) -> No
     write_transforms(
         tmp_path / "transforms.json", [frame], fl_x=120.0, cx=64, cy=48, w=128, h=96, k1=0.05, p1=0.001
     )
-    found = posed.find(tmp_path)
-    assert found is not None
-    view = found.load().views[0]
+    poses = posed.find(tmp_path)
+    assert poses is not None
+    view = poses.load().views[0]
     assert (view.camera.width, view.camera.height) == (64, 48)
     assert view.lens is not None
     assert view.lens.model == "OPENCV"
@@ -92,9 +92,9 @@ def test_names_are_found_by_suffix_and_without_extension(tmp_path: Path) -> None
         {"file_path": name, "transform_matrix": opengl([float(k), 0, 0])} for k, name in enumerate(names)
     ]
     write_transforms(tmp_path / "poses/transforms.json", frames, camera_angle_x=1.0)
-    found = posed.find(tmp_path)
-    assert found is not None
-    scene = found.load()
+    poses = posed.find(tmp_path)
+    assert poses is not None
+    scene = poses.load()
     assert {view.name: view.camera.center[0] for view in scene.views} == {
         "left/a.png": 0.0,
         "right/a.png": 1.0,
@@ -126,9 +126,9 @@ def test_points_are_read_from_within_the_capture_alone(tmp_path: Path) -> None:
 
     def points_named(name: str) -> tuple[int, tuple[str, ...]]:
         write_transforms(capture / "poses/transforms.json", [frame], camera_angle_x=1.0, ply_file_path=name)
-        found = posed.find(capture)
-        assert found is not None
-        scene = found.load()
+        poses = posed.find(capture)
+        assert poses is not None
+        scene = poses.load()
         return len(scene.points), scene.warnings
 
     assert points_named("../inside.ply") == (1, ())
@@ -145,9 +145,9 @@ def test_a_blender_set_keeps_its_own_split(tmp_path: Path) -> None:
             {"file_path": f"./{part}/r_{k}", "transform_matrix": opengl([k, 0, 0])} for k in range(count)
         ]
         write_transforms(tmp_path / f"transforms_{part}.json", frames, camera_angle_x=0.7)
-    found = posed.find(tmp_path)
-    assert found is not None
-    scene = found.load()
+    poses = posed.find(tmp_path)
+    assert poses is not None
+    scene = poses.load()
     train, test = split(scene)
     assert scene.source == "blender"
     assert [view.name for view in train] == ["train/r_0.png", "train/r_1.png"]
@@ -169,10 +169,10 @@ def test_what_cannot_be_a_camera_is_refused_by_name(tmp_path: Path, matrix: np.n
     write_photos(tmp_path / "images", ["a.png"])
     frame = {"file_path": "a.png", "transform_matrix": matrix.tolist()}
     write_transforms(tmp_path / "transforms.json", [frame], camera_angle_x=1.0)
-    found = posed.find(tmp_path)
-    assert found is not None
+    poses = posed.find(tmp_path)
+    assert poses is not None
     with pytest.raises(ValueError, match=words) as error:
-        found.load()
+        poses.load()
     assert "transforms.json" in str(error.value)
     assert "a.png" in str(error.value)
 
@@ -180,10 +180,10 @@ def test_what_cannot_be_a_camera_is_refused_by_name(tmp_path: Path, matrix: np.n
 def test_an_empty_list_of_frames_is_called_that(tmp_path: Path) -> None:
     write_photos(tmp_path / "images", ["a.png"])
     write_transforms(tmp_path / "transforms.json", [], camera_angle_x=1.0)
-    found = posed.find(tmp_path)
-    assert found is not None
+    poses = posed.find(tmp_path)
+    assert poses is not None
     with pytest.raises(ValueError, match=r"transforms\.json has no frames: it places no photo\."):
-        found.load()
+        poses.load()
 
 
 def colmap_model() -> pycolmap.Reconstruction:
@@ -207,9 +207,9 @@ def test_a_colmap_model_is_read_in_both_forms(tmp_path: Path, form: str) -> None
     half = camera.width // 2, camera.height // 2
     names = sorted(image.name for image in model.images.values())
     write_photos(tmp_path / "images", names[1:], half)
-    found = posed.find(tmp_path)
-    assert found is not None
-    scene = found.load()
+    poses = posed.find(tmp_path)
+    assert poses is not None
+    scene = poses.load()
     assert scene.source == "colmap"
     assert [view.name for view in scene.views] == names[1:]
     assert [name for name, _ in scene.left_out] == names[:1]
@@ -231,9 +231,9 @@ def test_a_colmap_model_wins_over_transforms(tmp_path: Path) -> None:
     model.write_binary(tmp_path / "sparse/0")
     write_photos(tmp_path / "images", [image.name for image in model.images.values()])
     write_transforms(tmp_path / "transforms.json", [])
-    found = posed.find(tmp_path)
-    assert found is not None
-    assert (found.source, len(found.warnings)) == ("colmap", 1)
+    poses = posed.find(tmp_path)
+    assert poses is not None
+    assert (poses.source, len(poses.warnings)) == ("colmap", 1)
 
 
 def test_a_broken_model_and_missing_photos_are_named(tmp_path: Path) -> None:
@@ -241,15 +241,15 @@ def test_a_broken_model_and_missing_photos_are_named(tmp_path: Path) -> None:
     folder.mkdir(parents=True)
     for name in ("cameras", "images", "points3D"):
         (folder / f"{name}.bin").write_bytes(b"\x01\x02\x03")
-    found = posed.find(tmp_path)
-    assert found is not None
+    poses = posed.find(tmp_path)
+    assert poses is not None
     with pytest.raises(ValueError, match="could not be read"):
-        found.load()
+        poses.load()
     colmap_model().write_binary(folder)
-    found = posed.find(tmp_path)
-    assert found is not None
+    poses = posed.find(tmp_path)
+    assert poses is not None
     with pytest.raises(ValueError, match="the capture has none of them"):
-        found.load()
+        poses.load()
 
 
 def test_a_folder_of_photos_alone_has_no_cameras(tmp_path: Path) -> None:
@@ -300,8 +300,8 @@ def test_a_photo_that_was_renamed_for_storage_has_its_camera(tmp_path: Path) -> 
     frames = [{"file_path": f"images/{name}", "transform_matrix": np.eye(4).tolist()} for name in names]
     document = {"fl_x": 60.0, "w": 64, "h": 48, "frames": frames}
     (tmp_path / "transforms.json").write_text(json.dumps(document))
-    given = posed.find(tmp_path)
-    assert given is not None
-    scene = given.load()
+    poses = posed.find(tmp_path)
+    assert poses is not None
+    scene = poses.load()
     assert {view.name for view in scene.views} == {storable_name(name) for name in names}
     assert scene.left_out == ()

@@ -77,14 +77,14 @@ def test_the_command_line_sends_them_and_the_decoders_read_them(
     tmp_path: Path, program: str, place: str
 ) -> None:
     """As files of a capture, in a process of its own; RealityScan's XMP files lie beside the photos."""
-    given, stored = tmp_path / "given", tmp_path / "capture"
-    folder = given / place
+    source, stored = tmp_path / "given", tmp_path / "capture"
+    folder = source / place
     folder.mkdir(parents=True)
     capture(folder, program)
     if program == "RealityScan, XMP":
         for path in list(folder.glob("*.xmp")):
             path.rename(folder / "images" / path.name)
-    for file in find_files(given).files:
+    for file in find_files(source).files:
         target = stored / file.role / file.name
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_bytes(file.path.read_bytes())
@@ -104,10 +104,10 @@ def test_a_file_that_is_cut_off_is_named(tmp_path: Path, program: str, share: fl
     if program == "RealityScan, XMP":
         for other in tmp_path.glob("*.xmp"):
             other.write_bytes(data[: int(share * len(data))])
-    found = posed.find(tmp_path)
-    assert found is not None
+    poses = posed.find(tmp_path)
+    assert poses is not None
     with pytest.raises(ValueError, match=r"The file .* of .* (could not be read|cannot be used)"):
-        found.load()
+        poses.load()
 
 
 MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
@@ -117,10 +117,10 @@ MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
 def test_mirrored_axes_are_refused_and_one_of_many_is_left_out(tmp_path: Path, program: str) -> None:
     photos(tmp_path / "images", size=SIZE)
     PROGRAMS[program].write(tmp_path, [MIRROR @ each for each in VIEWMATS], NAMES)
-    found = posed.find(tmp_path)
-    assert found is not None
+    poses = posed.find(tmp_path)
+    assert poses is not None
     with pytest.raises(ValueError, match="the determinant is -1"):
-        found.load()
+        poses.load()
     PROGRAMS[program].write(tmp_path, [MIRROR @ VIEWMATS[0], *VIEWMATS[1:]], NAMES)
     scene = loaded(tmp_path)
     assert [name for name, reason in scene.left_out if "determinant" in reason] == [NAMES[0]]
@@ -157,39 +157,39 @@ def test_wrong_files_are_refused_with_what_to_do(tmp_path: Path, wrong: str) -> 
     program, old, new, said = WRONG[wrong]
     path = capture(tmp_path, program)
     replaced(path, old, new)
-    found = posed.find(tmp_path)
-    assert found is not None
+    poses = posed.find(tmp_path)
+    assert poses is not None
     with pytest.raises(ValueError, match=said):
-        found.load()
+        poses.load()
 
 
 def test_other_distortion_models_of_realityscan_are_refused(tmp_path: Path) -> None:
     capture(tmp_path, "RealityScan, XMP")
     for path in tmp_path.glob("*.xmp"):
         replaced(path, "brown4t2", "division")
-    found = posed.find(tmp_path)
-    assert found is not None
+    poses = posed.find(tmp_path)
+    assert poses is not None
     with pytest.raises(ValueError, match="the distortion model is division"):
-        found.load()
+        poses.load()
 
 
 def test_focal_lengths_of_realityscan_in_pixels_are_refused(tmp_path: Path) -> None:
     capture(tmp_path, "RealityScan, XMP")
     for path in tmp_path.glob("*.xmp"):
         replaced(path, 'FocalLength35mm="29.0"', 'FocalLength35mm="2900.0"')
-    found = posed.find(tmp_path)
-    assert found is not None
+    poses = posed.find(tmp_path)
+    assert poses is not None
     with pytest.raises(ValueError, match="if it is in pixels"):
-        found.load()
+        poses.load()
 
 
 def test_bundler_without_its_list_is_refused(tmp_path: Path) -> None:
     capture(tmp_path, "Bundler")
     (tmp_path / "list.txt").unlink()
-    found = posed.find(tmp_path)
-    assert found is not None
+    poses = posed.find(tmp_path)
+    assert poses is not None
     with pytest.raises(ValueError, match=r"such as list\.txt, which is missing"):
-        found.load()
+        poses.load()
 
 
 def test_metashape_with_a_fourth_coefficient_and_with_a_fisheye_lens(tmp_path: Path) -> None:
@@ -320,13 +320,13 @@ UNREAD = [
 
 @pytest.mark.parametrize("name", UNREAD)
 def test_cameras_that_are_not_read_are_sent_so_that_the_job_names_them(tmp_path: Path, name: str) -> None:
-    given, stored = tmp_path / "given", tmp_path / "capture"
-    photos(given / "images")
-    (given / name).parent.mkdir(exist_ok=True)
-    (given / name).write_bytes(b"x")
-    found = find_files(given)
-    assert any(name in remark and "are not read" in remark for remark in found.remarks)
-    for file in found.files:
+    source, stored = tmp_path / "given", tmp_path / "capture"
+    photos(source / "images")
+    (source / name).parent.mkdir(exist_ok=True)
+    (source / name).write_bytes(b"x")
+    listing = find_files(source)
+    assert any(name in remark and "are not read" in remark for remark in listing.remarks)
+    for file in listing.files:
         target = stored / file.role / file.name
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_bytes(file.path.read_bytes())

@@ -104,8 +104,8 @@ def test_names_of_other_systems_are_matched(tmp_path: Path, kind: str) -> None:
     model(tmp_path / "colmap/sparse/0", {k: rename(name) for k, name in enumerate(NAMES)})
     check(loaded(tmp_path / "colmap"), ALL)
     photos(tmp_path / "nerf/images")
-    given = [frame | {"file_path": rename(name)} for name, frame in zip(NAMES, frames(), strict=True)]
-    transforms(tmp_path / "nerf/transforms.json", given)
+    entries = [frame | {"file_path": rename(name)} for name, frame in zip(NAMES, frames(), strict=True)]
+    transforms(tmp_path / "nerf/transforms.json", entries)
     check(loaded(tmp_path / "nerf"), ALL)
 
 
@@ -143,9 +143,9 @@ def test_a_blender_set_in_another_case_keeps_its_split(tmp_path: Path) -> None:
 def test_masks_and_points_with_backslashes_are_found(tmp_path: Path) -> None:
     photos(tmp_path / "images")
     photos(tmp_path / "cut", ["m.png"])
-    given = frames()
-    given[0]["mask_path"] = ".\\cut\\m.png"
-    transforms(tmp_path / "transforms.json", given)
+    entries = frames()
+    entries[0]["mask_path"] = ".\\cut\\m.png"
+    transforms(tmp_path / "transforms.json", entries)
     views = {view.name: view for view in loaded(tmp_path).views}
     assert views[NAMES[0]].mask == tmp_path / "cut/m.png"
 
@@ -162,9 +162,9 @@ def test_names_written_as_in_addresses_are_those_of_photos_masks_points_and_list
     photos(tmp_path / "images")
     photos(tmp_path / "my sam", ["cut out.png"])
     (tmp_path / "my points.ply").write_text(PLY)
-    given = frames([name.replace(" ", "%20") for name in NAMES])
-    given[0]["mask_path"] = "my%20sam/cut%20out.png"
-    document = {"w": 64, "h": 48, "fl_x": 60, "fl_y": 61, "cx": 32, "cy": 24, "frames": given}
+    entries = frames([name.replace(" ", "%20") for name in NAMES])
+    entries[0]["mask_path"] = "my%20sam/cut%20out.png"
+    document = {"w": 64, "h": 48, "fl_x": 60, "fl_y": 61, "cx": 32, "cy": 24, "frames": entries}
     document |= {
         "ply_file_path": "my%20points.ply",
         "test_filenames": [f"images/{NAMES[2]}"],
@@ -184,11 +184,11 @@ def test_masks_of_a_capture_are_found_by_the_paths_that_frames_name(tmp_path: Pa
     photos(tmp_path / "images")
     stored = tmp_path / ("masks/cut_0.png" if "masks" in named else "masks/sam/cut_0.png")
     photos(stored.parent, [stored.name])
-    given = frames()
-    given[0]["mask_path"] = named
-    given[1]["mask_path"] = "sam/gone.png"
+    entries = frames()
+    entries[0]["mask_path"] = named
+    entries[1]["mask_path"] = "sam/gone.png"
     (tmp_path / "poses").mkdir()
-    transforms(tmp_path / "poses/transforms.json", given)
+    transforms(tmp_path / "poses/transforms.json", entries)
     scene = loaded(tmp_path)
     assert {view.name: view.mask for view in scene.views if view.mask} == {NAMES[0]: stored}
     assert [each for each in scene.warnings if each.startswith("Masks that")] == [
@@ -255,14 +255,14 @@ def test_photos_of_one_name_that_are_no_copies_are_refused_with_both_named(
 @pytest.mark.parametrize("matrix", [None, [], "missing", "frame"])
 def test_a_frame_without_a_pose_is_left_out(tmp_path: Path, matrix: object) -> None:
     photos(tmp_path / "images")
-    given: list[Any] = frames()
+    entries: list[Any] = frames()
     if matrix == "frame":
-        given[7] = None
+        entries[7] = None
     elif matrix == "missing":
-        del given[7]["transform_matrix"]
+        del entries[7]["transform_matrix"]
     else:
-        given[7]["transform_matrix"] = matrix
-    transforms(tmp_path / "transforms.json", given)
+        entries[7]["transform_matrix"] = matrix
+    transforms(tmp_path / "transforms.json", entries)
     scene = loaded(tmp_path)
     check(scene, {name: k for name, k in ALL.items() if k != 7})
     assert "left out: 1 of 12 in transforms.json" in scene.warnings[0]
@@ -275,16 +275,16 @@ def test_one_frame_that_no_camera_can_be_is_left_out_and_several_are_refused(
     tmp_path: Path, value: float
 ) -> None:
     photos(tmp_path / "images")
-    given = frames()
-    given[7]["transform_matrix"] = [[value] * 4] * 4
-    transforms(tmp_path / "transforms.json", given)
+    entries = frames()
+    entries[7]["transform_matrix"] = [[value] * 4] * 4
+    transforms(tmp_path / "transforms.json", entries)
     scene = loaded(tmp_path)
     check(scene, {name: k for name, k in ALL.items() if k != 7})
     ((name, reason),) = scene.left_out
     assert name == NAMES[7]
     assert "Frame 7" in reason
-    given[3]["transform_matrix"] = given[7]["transform_matrix"]
-    transforms(tmp_path / "transforms.json", given)
+    entries[3]["transform_matrix"] = entries[7]["transform_matrix"]
+    transforms(tmp_path / "transforms.json", entries)
     with pytest.raises(ValueError, match="Frame 3"):
         loaded(tmp_path)
 

@@ -40,7 +40,7 @@ def scene_in(capture: Path, lenses: tuple[Lens | None, ...] = LENSES) -> Scene:
         camera = Camera(64, 48, 55.5, 56.5, 30.5, 24.5, viewmat)
         views.append(View(f"day one/{index}.png", camera, path, lens=lens))
     count = 30
-    seen = np.array([sorted(random.choice(len(views), 2, replace=False)) for _ in range(count)])
+    pairs = np.array([sorted(random.choice(len(views), 2, replace=False)) for _ in range(count)])
     return Scene(
         views=tuple(views),
         points=random.normal(size=(count, 3)),
@@ -48,7 +48,7 @@ def scene_in(capture: Path, lenses: tuple[Lens | None, ...] = LENSES) -> Scene:
         source="sfm",
         point_errors=random.uniform(0.1, 1.0, count),
         track_lengths=np.full(count, 2, np.int32),
-        point_views=PointViews(np.arange(0, 2 * count + 1, 2), seen.flatten().astype(np.int32)),
+        point_views=PointViews(np.arange(0, 2 * count + 1, 2), pairs.flatten().astype(np.int32)),
     )
 
 
@@ -59,10 +59,10 @@ def unpacked(scene: Scene, folder: Path, held_out: frozenset[str] = frozenset())
     return folder / "poses"
 
 
-def assert_same(found: Scene, wanted: Scene) -> None:
+def assert_same(actual: Scene, expected: Scene) -> None:
     """The same photos seen by the same cameras through the same lenses, and the same coloured points."""
-    assert [view.name for view in found.views] == [view.name for view in wanted.views]
-    for mine, theirs in zip(found.views, wanted.views, strict=True):
+    assert [view.name for view in actual.views] == [view.name for view in expected.views]
+    for mine, theirs in zip(actual.views, expected.views, strict=True):
         np.testing.assert_allclose(mine.camera.viewmat, theirs.camera.viewmat, atol=1e-12)
         if theirs.lens is None:
             assert mine.lens is None
@@ -70,17 +70,17 @@ def assert_same(found: Scene, wanted: Scene) -> None:
         else:
             assert mine.lens is not None
             assert_same_lens(mine.lens, theirs.lens)
-    order, other = (np.lexsort(scene.points.T) for scene in (found, wanted))
-    np.testing.assert_allclose(found.points[order], wanted.points[other], atol=1e-12)
-    np.testing.assert_array_equal(found.colors[order], wanted.colors[other])
+    order, other = (np.lexsort(scene.points.T) for scene in (actual, expected))
+    np.testing.assert_allclose(actual.points[order], expected.points[other], atol=1e-12)
+    np.testing.assert_array_equal(actual.colors[order], expected.colors[other])
 
 
-def assert_same_lens(found: Lens, wanted: Lens) -> None:
+def assert_same_lens(actual: Lens, expected: Lens) -> None:
     """Both project the same rays to the same places, in shares of the photo."""
     rays = np.random.default_rng(0).uniform(-0.4, 0.4, (50, 3))
     rays[:, 2] = 1.0
     places = []
-    for lens in (found, wanted):
+    for lens in (actual, expected):
         camera = pycolmap.Camera(
             model=lens.model, width=lens.width, height=lens.height, params=list(lens.params)
         )
@@ -92,10 +92,10 @@ def test_the_colmap_model_is_read_back_as_the_same_scene(tmp_path: Path) -> None
     scene = scene_in(tmp_path)
     folder = unpacked(scene, tmp_path)
     (folder / "transforms.json").unlink()
-    found = posed.find(tmp_path)
-    assert found is not None
-    assert found.source == "colmap"
-    read = found.load()
+    poses = posed.find(tmp_path)
+    assert poses is not None
+    assert poses.source == "colmap"
+    read = poses.load()
     assert_same(read, scene)
     assert read.point_views is not None
     assert scene.point_views is not None
@@ -133,10 +133,10 @@ def test_transforms_json_is_read_back_as_the_same_scene(tmp_path: Path) -> None:
     assert len(document["train_filenames"]) == 3
     for file in (folder / "sparse/0").iterdir():
         file.unlink()
-    found = posed.find(tmp_path)
-    assert found is not None
-    assert found.source == "transforms"
-    read = found.load()
+    poses = posed.find(tmp_path)
+    assert poses is not None
+    assert poses.source == "transforms"
+    read = poses.load()
     assert_same(read, scene)
     assert {view.name for view in read.views if view.split == "test"} == held_out
 
@@ -153,9 +153,9 @@ def test_refined_cameras_and_the_offset_are_those_of_the_model(tmp_path: Path) -
     write_cameras(tmp_path / "cameras.zip", moved, refined, far, frozenset())
     with zipfile.ZipFile(tmp_path / "cameras.zip") as archive:
         archive.extractall(tmp_path / "poses")
-    found = posed.find(tmp_path)
-    assert found is not None
-    read = found.load()
+    poses = posed.find(tmp_path)
+    assert poses is not None
+    read = poses.load()
     np.testing.assert_allclose(read.views[1].camera.viewmat, refined[scene.views[1].name], atol=1e-12)
     np.testing.assert_allclose(read.views[2].camera.center, scene.views[2].camera.center, atol=1e-9)
     np.testing.assert_allclose(sorted(read.points[:, 0]), sorted(scene.points[:, 0]), atol=1e-9)
@@ -180,6 +180,6 @@ def test_a_scene_without_points_is_a_model_too(tmp_path: Path) -> None:
         point_views=None,
     )
     unpacked(scene, tmp_path)
-    found = posed.find(tmp_path)
-    assert found is not None
-    assert_same(found.load(), scene)
+    poses = posed.find(tmp_path)
+    assert poses is not None
+    assert_same(poses.load(), scene)

@@ -60,16 +60,16 @@ def scene_of(capture: Path, work: Path):
 def test_a_zip_gives_the_scene_of_its_folder(folder: Path, tmp_path: Path, top: str) -> None:
     zip_of(folder, tmp_path / "capture" / "images" / "set.zip", top)
     expected = scene_of(folder, tmp_path / "plain")
-    found = scene_of(tmp_path / "capture", tmp_path / "work")
-    assert found.source == expected.source
-    assert [view.name for view in found.views] == [view.name for view in expected.views]
-    assert [view.split for view in found.views] == [view.split for view in expected.views]
-    for one, other in zip(found.views, expected.views, strict=True):
+    scene = scene_of(tmp_path / "capture", tmp_path / "work")
+    assert scene.source == expected.source
+    assert [view.name for view in scene.views] == [view.name for view in expected.views]
+    assert [view.split for view in scene.views] == [view.split for view in expected.views]
+    for one, other in zip(scene.views, expected.views, strict=True):
         np.testing.assert_array_equal(one.camera.viewmat, other.camera.viewmat)
         np.testing.assert_array_equal(one.camera.K, other.camera.K)
         assert one.mask is not None
         assert other.mask is not None
-    np.testing.assert_array_equal(found.points, expected.points)
+    np.testing.assert_array_equal(scene.points, expected.points)
 
 
 def test_a_zip_is_unpacked_once(folder: Path, tmp_path: Path) -> None:
@@ -86,9 +86,9 @@ def test_masks_without_cameras_keep_their_role(folder: Path, tmp_path: Path) -> 
         path.unlink()
     shutil.rmtree(folder / "sparse", ignore_errors=True)
     zip_of(folder, tmp_path / "capture" / "images" / "set.zip")
-    found = zipped.data_set(tmp_path / "capture", tmp_path / "work")
-    assert (found / "masks").is_dir()
-    assert (found / "images").is_dir()
+    root = zipped.data_set(tmp_path / "capture", tmp_path / "work")
+    assert (root / "masks").is_dir()
+    assert (root / "images").is_dir()
 
 
 def test_other_captures_are_read_as_they_are(folder: Path, tmp_path: Path) -> None:
@@ -122,9 +122,9 @@ def test_a_zip_that_unpacks_to_too_much_is_refused(
     assert refused.value.code == "archive_bomb"
 
 
-def stored(given: Path, capture: Path) -> Path:
+def stored(source: Path, capture: Path) -> Path:
     """The capture that the command line makes of a folder."""
-    for file in find_files(given).files:
+    for file in find_files(source).files:
         target = capture / file.role / file.name
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_bytes(file.path.read_bytes())
@@ -135,16 +135,16 @@ def stored(given: Path, capture: Path) -> Path:
 @pytest.mark.parametrize("sent", [True, False])
 def test_cameras_in_a_zip_among_loose_photos_are_found(tmp_path: Path, program: str, sent: bool) -> None:
     """Of a folder by the command line, and of a capture in which photos and zip lie side by side."""
-    given = tmp_path / "given/images"
-    posed_sets.photos(given, size=SIZE)
+    source = tmp_path / "given/images"
+    posed_sets.photos(source, size=SIZE)
     cameras = tmp_path / "cameras"
     (cameras / "scan").mkdir(parents=True)
     PROGRAMS[program].write(cameras / "scan", [posed_sets.viewmat(k) for k in range(posed_sets.COUNT)], NAMES)
-    zip_of(cameras, given / "cams.zip")
-    capture = stored(given, tmp_path / "capture") if sent else tmp_path / "given"
-    found = zipped.cameras_beside(capture, tmp_path / "work")
-    assert found is not None
-    scene = found.load()
+    zip_of(cameras, source / "cams.zip")
+    capture = stored(source, tmp_path / "capture") if sent else tmp_path / "given"
+    poses = zipped.cameras_beside(capture, tmp_path / "work")
+    assert poses is not None
+    scene = poses.load()
     for view in scene.views:
         expected = posed_sets.viewmat(posed_sets.ALL[view.name])
         np.testing.assert_allclose(view.camera.viewmat, expected, atol=1e-6)
@@ -159,13 +159,13 @@ def test_cameras_in_a_zip_among_loose_photos_are_found(tmp_path: Path, program: 
 def test_models_and_transforms_in_such_a_zip_are_found(
     tmp_path: Path, write: Callable[[Path], object]
 ) -> None:
-    given = tmp_path / "given"
-    posed_sets.photos(given)
+    source = tmp_path / "given"
+    posed_sets.photos(source)
     write(tmp_path / "cameras/a/0")
-    zip_of(tmp_path / "cameras", given / "cams.zip")
-    found = zipped.cameras_beside(stored(given, tmp_path / "capture"), tmp_path / "work")
-    assert found is not None
-    posed_sets.check(found.load(), posed_sets.ALL)
+    zip_of(tmp_path / "cameras", source / "cams.zip")
+    poses = zipped.cameras_beside(stored(source, tmp_path / "capture"), tmp_path / "work")
+    assert poses is not None
+    posed_sets.check(poses.load(), posed_sets.ALL)
 
 
 def test_cameras_in_a_zip_with_photos_are_named(tmp_path: Path) -> None:

@@ -44,20 +44,20 @@ def depths(bare: Scene) -> list[np.ndarray]:
     return [synthetic.photograph(still, view.camera, samples=1)[1] for view in bare.views]
 
 
-def shows(found: stereo.StereoPoints, views: int) -> np.ndarray:
+def shows(cloud: stereo.StereoPoints, views: int) -> np.ndarray:
     """Which of so many views show each point, bool [n,views]."""
-    table = np.zeros((len(found.points), views), bool)
-    table[np.repeat(np.arange(len(table)), np.diff(found.offsets)), found.views] = True
+    table = np.zeros((len(cloud.points), views), bool)
+    table[np.repeat(np.arange(len(table)), np.diff(cloud.offsets)), cloud.views] = True
     return table
 
 
-def depth_errors(scene: Scene, found: stereo.StereoPoints, depths: list[np.ndarray]) -> np.ndarray:
+def depth_errors(scene: Scene, cloud: stereo.StereoPoints, depths: list[np.ndarray]) -> np.ndarray:
     """Relative depth error of each point in the first view that saw it; the nearest true depth of 3 x 3 pixels."""
     errors = []
-    seen = shows(found, len(scene.views))
+    visible = shows(cloud, len(scene.views))
     for index, view in enumerate(scene.views):
-        own = seen[:, index] & ~seen[:, :index].any(axis=1)
-        x, y, z, _ = view.camera.project(found.points[own])
+        own = visible[:, index] & ~visible[:, :index].any(axis=1)
+        x, y, z, _ = view.camera.project(cloud.points[own])
         depth = depths[index]
         rows = np.clip(y.astype(int)[:, None] + np.repeat([-1, 0, 1], 3), 0, HEIGHT - 1)
         columns = np.clip(x.astype(int)[:, None] + np.tile([-1, 0, 1], 3), 0, WIDTH - 1)
@@ -89,14 +89,14 @@ def test_colours_are_those_of_the_photos(bare: Scene, added: stereo.StereoPoints
 
 
 def test_known_points_stay_and_empty_places_are_filled(bare: Scene, added: stereo.StereoPoints) -> None:
-    seen = shows(added, len(bare.views))[::3]
+    visible = shows(added, len(bare.views))[::3]
     few = replace(
         added,
         points=added.points[::3],
         colors=added.colors[::3],
         errors=added.errors[::3],
-        views=np.nonzero(seen)[1].astype(np.int32),
-        offsets=np.concatenate([[0], np.cumsum(seen.sum(axis=1))]),
+        views=np.nonzero(visible)[1].astype(np.int32),
+        offsets=np.concatenate([[0], np.cumsum(visible.sum(axis=1))]),
     )
     first = stereo.add(bare, few)
     more = stereo.find_points(first)
@@ -117,10 +117,10 @@ def test_masked_places_get_no_points(bare: Scene, tmp_path: Path) -> None:
     Image.fromarray(mask).save(tmp_path / "mask.png")
     views = [replace(view, mask=tmp_path / "mask.png") for view in bare.views[:3]]
     grey = [GreyView.of(photo) for photo in load_views(views, WIDTH)]
-    found = sweep(grey[1], [grey[0], grey[2]], grey[1].camera.project(bare.points), 1.5, 12.0)
-    assert found.tried > 50
-    assert len(found.points) > 20
-    assert grey[1].camera.project(found.points).columns.min() >= WIDTH // 2
+    outcome = sweep(grey[1], [grey[0], grey[2]], grey[1].camera.project(bare.points), 1.5, 12.0)
+    assert outcome.tried > 50
+    assert len(outcome.points) > 20
+    assert grey[1].camera.project(outcome.points).columns.min() >= WIDTH // 2
 
 
 def of_noise(scene: Scene, count: int, folder: Path) -> Scene:
@@ -134,10 +134,10 @@ def of_noise(scene: Scene, count: int, folder: Path) -> Scene:
 
 
 def test_the_search_is_given_up_for_photos_without_a_common_scene(bare: Scene, tmp_path: Path) -> None:
-    found = stereo.find_points(of_noise(bare, len(bare.views), tmp_path))
-    assert found.given_up
-    assert len(found.points) == 0
-    assert stereo.add(bare, found).facts["stereo_points"] == 0
+    cloud = stereo.find_points(of_noise(bare, len(bare.views), tmp_path))
+    assert cloud.given_up
+    assert len(cloud.points) == 0
+    assert stereo.add(bare, cloud).facts["stereo_points"] == 0
 
 
 def test_scenes_with_enough_points_get_none(bare: Scene, tmp_path: Path) -> None:
@@ -160,9 +160,9 @@ def test_loading_photos_can_be_cancelled(bare: Scene, tmp_path: Path) -> None:
 
 
 def test_the_search_is_given_up_for_three_photos_too(bare: Scene, tmp_path: Path) -> None:
-    found = stereo.find_points(of_noise(bare, 3, tmp_path))
-    assert found.given_up
-    assert len(found.points) == 0
+    cloud = stereo.find_points(of_noise(bare, 3, tmp_path))
+    assert cloud.given_up
+    assert len(cloud.points) == 0
 
 
 def test_photos_held_out_by_the_data_set_take_no_part(
@@ -175,12 +175,12 @@ def test_photos_held_out_by_the_data_set_take_no_part(
         else replace(view, split="train")
         for i, view in enumerate(bare.views)
     )
-    found = stereo.find_points(replace(bare, views=views))
-    assert len(found.points) > 300
-    seen = shows(found, len(views))
-    assert not seen[:, tests].any()
-    assert seen[:, 1].any()
-    assert np.median(depth_errors(bare, found, depths)) < 0.01
+    cloud = stereo.find_points(replace(bare, views=views))
+    assert len(cloud.points) > 300
+    visible = shows(cloud, len(views))
+    assert not visible[:, tests].any()
+    assert visible[:, 1].any()
+    assert np.median(depth_errors(bare, cloud, depths)) < 0.01
 
 
 def test_without_tracks_of_its_own_points_a_scene_gets_none(bare: Scene, added: stereo.StereoPoints) -> None:

@@ -69,13 +69,13 @@ def walk(count: int, size: float, error: float, wrong: int, dimensions: int = 2)
 @pytest.mark.parametrize("dimensions", [2, 3])
 def test_noise_and_gross_errors_of_gps(dimensions: int) -> None:
     centers, measured = walk(40, 80.0, 2.0, 10, dimensions)
-    found = georeference.fit(centers, measured)
-    assert not isinstance(found, str), found
-    assert found.scale == pytest.approx(7.0, rel=0.03)
-    assert 26 <= found.agreeing.sum() <= 30
-    assert 1.0 < found.error < 3.5
+    fit = georeference.fit(centers, measured)
+    assert not isinstance(fit, str), fit
+    assert fit.scale == pytest.approx(7.0, rel=0.03)
+    assert 26 <= fit.agreeing.sum() <= 30
+    assert 1.0 < fit.error < 3.5
     clean = walk(40, 80.0, 0.0, 0, dimensions)[1]
-    moved = found.scale * centers @ found.rotation.T + found.translation
+    moved = fit.scale * centers @ fit.rotation.T + fit.translation
     assert np.linalg.norm(moved - clean, axis=1).max() < 2.5
 
 
@@ -89,9 +89,9 @@ def test_noise_and_gross_errors_of_gps(dimensions: int) -> None:
     ],
 )
 def test_what_gps_does_not_tell(photos: int, size: float, error: float, wrong: int, why: str) -> None:
-    found = georeference.fit(*walk(photos, size, error, wrong))
-    assert isinstance(found, str)
-    assert any(part in found for part in why.split("|")), found
+    outcome = georeference.fit(*walk(photos, size, error, wrong))
+    assert isinstance(outcome, str)
+    assert any(part in outcome for part in why.split("|")), outcome
 
 
 def test_photos_at_one_place_tell_nothing() -> None:
@@ -102,11 +102,11 @@ def test_photos_at_one_place_tell_nothing() -> None:
 
 def test_down_by_gps_needs_two_directions() -> None:
     centers, measured = walk(40, 80.0, 1.0, 0, 3)
-    found = georeference.fit(centers, measured)
-    assert not isinstance(found, str)
-    down = georeference.down_by(found)
+    fit = georeference.fit(centers, measured)
+    assert not isinstance(fit, str)
+    down = georeference.down_by(fit)
     assert down is not None
-    assert math.degrees(math.acos(min(1.0, float(-(found.rotation @ down)[2])))) < 1e-3
+    assert math.degrees(math.acos(min(1.0, float(-(fit.rotation @ down)[2])))) < 1e-3
     line = np.stack([np.linspace(0, 300, 30), np.zeros(30), np.zeros(30)], axis=1)
     straight = georeference.fit(line, line + np.random.default_rng(0).normal(0, 1, line.shape))
     assert not isinstance(straight, str)

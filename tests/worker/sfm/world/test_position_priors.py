@@ -68,8 +68,8 @@ def flight(curvature: float) -> tuple[pycolmap.Reconstruction, Float]:
         local = (points - center) @ rotation.T
         pixels = FOCAL * local[:, :2] / local[:, 2:] + [WIDTH / 2, HEIGHT / 2]
         pixels += rng.normal(0.0, 0.33, pixels.shape)
-        seen = np.flatnonzero(((pixels > 0) & (pixels < [WIDTH, HEIGHT])).all(axis=1))
-        keep = rng.permutation(seen)[:60]
+        visible = np.flatnonzero(((pixels > 0) & (pixels < [WIDTH, HEIGHT])).all(axis=1))
+        keep = rng.permutation(visible)[:60]
         image = pycolmap.Image(
             name=f"{number:06d}.png", keypoints=pixels[keep], camera_id=1, image_id=number + 1
         )
@@ -129,8 +129,8 @@ def adjusted(
         count=len(photos), cancelled=lambda: False, on_mapping=lambda done, total, note: reports.append(note),
     )  # fmt: skip
     scales = scales or [np.ones(len(model.images[number + 1].points2D)) for number in range(len(photos))]
-    found: Any = SimpleNamespace(features=[SimpleNamespace(scales=each) for each in scales])
-    model, warnings = final_model._polished(run, found, copy.deepcopy(model), fixed)
+    result: Any = SimpleNamespace(features=[SimpleNamespace(scales=each) for each in scales])
+    model, warnings = final_model._polished(run, result, copy.deepcopy(model), fixed)
     assert reports
     assert not warnings
     return model, run.notes

@@ -34,8 +34,8 @@ def turned(rotations: Float) -> tuple[Float, Float]:
     return rotations @ turn.T, turn[:, 1]
 
 
-def degrees(found: Float, truth: Float) -> float:
-    return math.degrees(math.acos(np.clip(found @ truth, -1.0, 1.0)))
+def degrees(direction: Float, truth: Float) -> float:
+    return math.degrees(math.acos(np.clip(direction @ truth, -1.0, 1.0)))
 
 
 def unsteady(count: int, yaw: Float, pitch: float) -> Float:
@@ -112,5 +112,5 @@ def test_cameras_around_a_thing_look_at_it_though_some_look_away() -> None:
 @pytest.mark.parametrize("points", [np.array([[0.0, 0, 9], [1, 0, 10], [0, 1, 11]]), np.zeros((0, 3))])
 def test_cameras_that_look_one_way_look_at_the_points_or_ahead(points: Float) -> None:
     centers = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
-    found = focus_of(centers, np.tile([0.0, 0, 1], (3, 1)), points)
-    np.testing.assert_allclose(found, [0, 0, 10] if len(points) else [1, 0, 2], atol=1e-9)
+    focus = focus_of(centers, np.tile([0.0, 0, 1], (3, 1)), points)
+    np.testing.assert_allclose(focus, [0, 0, 10] if len(points) else [1, 0, 2], atol=1e-9)

@@ -28,14 +28,14 @@ def test_a_scene_survives_within_the_steps_of_the_format(tmp_path: Path, degree:
     assert compressed_ply.write(tmp_path / "m.compressed.ply", before) == 600
     after = compressed_ply.read(tmp_path / "m.compressed.ply").gaussians
     before.sh[7, 1:] = 4.0
-    found = differences(after, matched(after, before))
+    errors = differences(after, matched(after, before))
     extent = float((before.means.amax(dim=0) - before.means.amin(dim=0)).max())
-    assert found["means"] <= extent / 1023 / 2 * 1.01
-    assert found["log_scales"] <= 10 / 1023 / 2 * 1.01
-    assert found["quats"] < 4e-6  # three components in steps of 1 / 723
-    assert found["opacities"] <= 1 / 255 / 2 * 1.01
-    assert found["harmonics"] <= 8 / 256 / 2 * 1.01
-    assert found["dc"] <= 32 / 255 / 2
+    assert errors["means"] <= extent / 1023 / 2 * 1.01
+    assert errors["log_scales"] <= 10 / 1023 / 2 * 1.01
+    assert errors["quats"] < 4e-6  # three components in steps of 1 / 723
+    assert errors["opacities"] <= 1 / 255 / 2 * 1.01
+    assert errors["harmonics"] <= 8 / 256 / 2 * 1.01
+    assert errors["dc"] <= 32 / 255 / 2
 
 
 def test_a_file_has_sixteen_bytes_a_gaussian_and_the_header_that_others_read(tmp_path: Path) -> None:
@@ -68,10 +68,10 @@ def test_splat_transform_reads_what_we_write(tmp_path: Path) -> None:
     scene = some_gaussians(700, 3)
     compressed_ply.write(tmp_path / "ours.compressed.ply", scene)
     convert(tmp_path / "ours.compressed.ply", tmp_path / "theirs.ply")
-    found = differences(
+    errors = differences(
         ply.read(tmp_path / "theirs.ply").gaussians, registry.read(tmp_path / "ours.compressed.ply").gaussians
     )
-    assert max(found.values()) < 1e-5
+    assert max(errors.values()) < 1e-5
 
 
 def test_we_read_what_splat_transform_writes(tmp_path: Path) -> None:

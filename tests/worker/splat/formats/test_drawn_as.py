@@ -19,7 +19,7 @@ from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.storage import Storage
 from splatmill.schema import CameraSpec, EditModel
 from splatmill.schema.files.formats import MODEL_FORMATS
-from splatmill_worker.render_service.clean import Wanted, clean_file
+from splatmill_worker.render_service.clean import CleanSettings, clean_file
 from splatmill_worker.render_service.convert import convert
 from splatmill_worker.render_service.edit import edit
 from splatmill_worker.render_service.encoding import camera_of, render_frame
@@ -116,7 +116,7 @@ def test_a_file_alone_is_drawn_converted_and_cleaned_as_it_says(tmp_path: Path) 
     assert float((picture - right.clamp(0, 1)).abs().max()) < 0.01
     outs = [tmp_path / (f"out{suffix}" if suffix.startswith(".") else suffix) for suffix in WRITTEN]
     convert(model, outs, None)
-    clean_file(model, tmp_path / "cleaned.ply", Wanted(edit=BOX))
+    clean_file(model, tmp_path / "cleaned.ply", CleanSettings(edit=BOX))
     assert all(read(out).antialiased for out in [*outs, tmp_path / "cleaned.ply"])
 
 

@@ -126,8 +126,8 @@ def _changed(data: bytes, change: Callable[[dict[str, Any]], Any]) -> bytes:
 
 
 def _primitive(document: dict[str, Any]) -> dict[str, Any]:
-    found: dict[str, Any] = document["meshes"][0]["primitives"][0]
-    return found
+    primitive: dict[str, Any] = document["meshes"][0]["primitives"][0]
+    return primitive
 
 
 @pytest.mark.parametrize(

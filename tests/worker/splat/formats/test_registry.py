@@ -26,9 +26,9 @@ def test_the_table_of_formats_says_what_can_be_read_and_written() -> None:
 
 
 def test_the_longest_suffix_counts_in_any_case() -> None:
-    found = format_of("Scene.Compressed.PLY")
-    assert found is not None
-    assert found.suffix == ".compressed.ply"
+    compressed = format_of("Scene.Compressed.PLY")
+    assert compressed is not None
+    assert compressed.suffix == ".compressed.ply"
     assert format_of("scene.obj") is None
     streamed = format_of("lod-meta.json")
     assert streamed is not None

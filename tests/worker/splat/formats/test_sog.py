@@ -38,14 +38,14 @@ def test_a_scene_survives_within_the_steps_of_the_format(tmp_path: Path, degree:
     contents = sog.read(tmp_path / "m.sog")
     assert contents.offset == (450_000.0, -7.0, 0.0)
     assert contents.antialiased is True
-    found = differences(contents.gaussians, matched(contents.gaussians, before))
+    errors = differences(contents.gaussians, matched(contents.gaussians, before))
     reach = before.means.abs().max()
-    assert found["means"] <= float(2 * reach.log1p() / 65535 / 2 * (1 + reach)) * 1.01
-    assert found["quats"] < 3e-5  # three components in steps of sqrt(2) / 255
-    assert found["opacities"] <= 1 / 255 / 2 * 1.01
-    assert found["log_scales"] < 1e-6
-    assert found["dc"] < 1e-6
-    assert found["harmonics"] < 1e-6  # fewer Gaussians than centroids, fewer values than the codebook holds
+    assert errors["means"] <= float(2 * reach.log1p() / 65535 / 2 * (1 + reach)) * 1.01
+    assert errors["quats"] < 3e-5  # three components in steps of sqrt(2) / 255
+    assert errors["opacities"] <= 1 / 255 / 2 * 1.01
+    assert errors["log_scales"] < 1e-6
+    assert errors["dc"] < 1e-6
+    assert errors["harmonics"] < 1e-6  # fewer Gaussians than centroids, fewer values than the codebook holds
 
 
 def test_the_palette_keeps_what_is_seen_better_than_what_is_not(tmp_path: Path) -> None:
@@ -66,10 +66,10 @@ def test_the_palette_keeps_what_is_seen_better_than_what_is_not(tmp_path: Path) 
 def test_splat_transform_reads_what_we_write(tmp_path: Path) -> None:
     sog.write(tmp_path / "ours.sog", some_gaussians(700, 3))
     convert(tmp_path / "ours.sog", tmp_path / "theirs.ply")
-    found = differences(
+    errors = differences(
         ply.read(tmp_path / "theirs.ply").gaussians, registry.read(tmp_path / "ours.sog").gaussians
     )
-    assert max(found.values()) < 1e-5
+    assert max(errors.values()) < 1e-5
 
 
 def test_we_read_what_splat_transform_writes(tmp_path: Path) -> None:
@@ -77,12 +77,12 @@ def test_we_read_what_splat_transform_writes(tmp_path: Path) -> None:
     ply.write(tmp_path / "ours.ply", scene)
     convert(tmp_path / "ours.ply", tmp_path / "theirs.sog", "-g", "cpu", "-i", "1")
     after = registry.read(tmp_path / "theirs.sog").gaussians
-    found = differences(after, matched(after, scene))
-    assert found["means"] < 1e-3
-    assert found["quats"] < 1.2e-4  # its bytes are cut off, not rounded
-    assert found["opacities"] <= 1 / 255
-    assert found["log_scales"] < 0.5
-    assert found["dc"] < 0.5
+    errors = differences(after, matched(after, scene))
+    assert errors["means"] < 1e-3
+    assert errors["quats"] < 1.2e-4  # its bytes are cut off, not rounded
+    assert errors["opacities"] <= 1 / 255
+    assert errors["log_scales"] < 0.5
+    assert errors["dc"] < 0.5
 
 
 def test_an_unpacked_model_is_the_packed_one(tmp_path: Path) -> None:

@@ -50,9 +50,9 @@ def test_a_splat_file_is_read_as_others_read_it(tmp_path: Path) -> None:
     (tmp_path / "m.splat").write_bytes(splat_file(80))
     ours = splat.read(tmp_path / "m.splat").gaussians
     convert(tmp_path / "m.splat", tmp_path / "theirs.ply")
-    found = differences(ours, ply.read(tmp_path / "theirs.ply").gaussians)
-    assert found.pop("quats") < 1e-4  # a byte is (b - 128) / 128 here and b / 127.5 - 1 there
-    assert max(found.values()) < 1e-5
+    errors = differences(ours, ply.read(tmp_path / "theirs.ply").gaussians)
+    assert errors.pop("quats") < 1e-4  # a byte is (b - 128) / 128 here and b / 127.5 - 1 there
+    assert max(errors.values()) < 1e-5
 
 
 @pytest.mark.parametrize(("level", "rest"), [(1, 0), (1, 9), (1, 24), (2, 24)])
@@ -63,8 +63,8 @@ def test_a_ksplat_file_is_read_as_others_read_it(tmp_path: Path, level: int, res
     ours = ksplat.read(path).gaussians
     assert np.abs(ours.means.numpy() - scene[0]).max() < 1e-3
     convert(path, tmp_path / "theirs.ply")
-    found = differences(ours, ply.read(tmp_path / "theirs.ply").gaussians)
-    assert max(found.values()) < 1e-5
+    errors = differences(ours, ply.read(tmp_path / "theirs.ply").gaussians)
+    assert max(errors.values()) < 1e-5
 
 
 @pytest.mark.skipif(not OTHERS.is_dir(), reason="needs ../shared/data/splats")
@@ -84,10 +84,10 @@ def test_flat_gaussians_stay_and_broken_ones_go(tmp_path: Path) -> None:
     rows["mean"][2, 0] = np.nan
     rows["quat"][3] = 128
     (tmp_path / "m.splat").write_bytes(rows.tobytes())
-    found = splat.read(tmp_path / "m.splat")
-    assert found.gaussians.count == 1
-    assert bool(torch.isfinite(found.gaussians.log_scales).all())
-    assert found.notes == (
+    contents = splat.read(tmp_path / "m.splat")
+    assert contents.gaussians.count == 1
+    assert bool(torch.isfinite(contents.gaussians.log_scales).all())
+    assert contents.notes == (
         "Gaussians with a value that is not finite, or a quaternion of zeros, are left out: 3 of 4.",
     )
 

@@ -50,14 +50,14 @@ def test_a_scene_survives_within_the_steps_of_the_format(tmp_path: Path, degree:
     assert spz.write(tmp_path / "m.spz", before, sh_bits=bits, antialiased=True) == 400
     contents = spz.read(tmp_path / "m.spz")
     assert contents.antialiased is True
-    found = differences(contents.gaussians, matched(contents.gaussians, before))
+    errors = differences(contents.gaussians, matched(contents.gaussians, before))
     smallest = float(before.log_scales.amax(dim=1).exp().min())
-    assert found["means"] <= smallest / 20
-    assert found["log_scales"] <= 1 / 32 + 1e-6
-    assert found["quats"] < 4e-6
-    assert found["opacities"] <= 0.5 / 255 + 1e-6
-    assert found["dc"] <= 0.5 / 255 / 0.15 + 1e-6
-    assert found["harmonics"] <= 2**-bits + 1e-6
+    assert errors["means"] <= smallest / 20
+    assert errors["log_scales"] <= 1 / 32 + 1e-6
+    assert errors["quats"] < 4e-6
+    assert errors["opacities"] <= 0.5 / 255 + 1e-6
+    assert errors["dc"] <= 0.5 / 255 / 0.15 + 1e-6
+    assert errors["harmonics"] <= 2**-bits + 1e-6
 
 
 def test_a_scene_far_out_gets_fewer_bits_after_the_point(tmp_path: Path) -> None:
@@ -108,12 +108,12 @@ def test_we_read_what_the_library_of_the_format_writes(tmp_path: Path, version: 
     before = within_one(some_gaussians(300, 3))
     niantic_spz.write(tmp_path / "theirs.spz", before, version=version, bits=bits)
     contents = spz.read(tmp_path / "theirs.spz")
-    found = differences(contents.gaussians, matched(contents.gaussians, before))
+    errors = differences(contents.gaussians, matched(contents.gaussians, before))
     assert contents.antialiased
-    assert found["means"] < 2e-4
-    assert found["quats"] < (4e-6 if version > 2 else 5e-3)
-    assert found["dc"] < 0.015
-    assert found["harmonics"] <= 2**-bits * 1.5
+    assert errors["means"] < 2e-4
+    assert errors["quats"] < (4e-6 if version > 2 else 5e-3)
+    assert errors["dc"] < 0.015
+    assert errors["harmonics"] <= 2**-bits * 1.5
 
 
 def test_splat_transform_reads_what_we_write_without_the_turn(tmp_path: Path) -> None:

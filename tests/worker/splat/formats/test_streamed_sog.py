@@ -109,11 +109,11 @@ def test_splat_transform_reads_every_level(tmp_path: Path, written: Path, levels
     convert(written, tmp_path / "theirs.ply", "-L", str(level))
     theirs = ply.read(tmp_path / "theirs.ply").gaussians
     ours = matched(theirs, levels.levels[level].gaussians)
-    found = differences(theirs, ours)
+    errors = differences(theirs, ours)
     reach = float(ours.means.abs().max())
-    assert found["means"] <= 2 * np.log1p(reach) / 65535 / 2 * (1 + reach) * 1.01
-    assert found["opacities"] <= 1 / 255 / 2 * 1.01
-    assert found["quats"] < 3e-5
+    assert errors["means"] <= 2 * np.log1p(reach) / 65535 / 2 * (1 + reach) * 1.01
+    assert errors["opacities"] <= 1 / 255 / 2 * 1.01
+    assert errors["quats"] < 3e-5
     assert float((theirs.log_scales - ours.log_scales).square().mean().sqrt()) < 0.03  # 256 values of each
     assert float((theirs.sh[:, 0] - ours.sh[:, 0]).square().mean().sqrt()) < 0.01
 
@@ -130,9 +130,9 @@ def test_level_0_and_the_environment_are_read_back(tmp_path: Path) -> None:
     back = registry.read(path)
     assert (back.offset, back.antialiased) == ((1000.0, 0.0, -2.0), True)
     assert back.gaussians.count == 6200
-    found = differences(back.gaussians, matched(back.gaussians, scene))
-    assert found["means"] < 0.01
-    assert found["opacities"] <= 1 / 255
+    errors = differences(back.gaussians, matched(back.gaussians, scene))
+    assert errors["means"] < 0.01
+    assert errors["opacities"] <= 1 / 255
     assert registry.size(path) == sum(
         file.stat().st_size for file in path.parent.rglob("*") if file.is_file()
     )

@@ -101,8 +101,8 @@ def test_every_level_is_the_whole_scene_in_tiles_that_their_boxes_hold(written: 
     assert counts == {0: 375, 1: 1500, 2: 6000}, "of the surroundings nothing"
     whole = _scene()
     whole = whole.select(whole.means.norm(dim=1) < 20)
-    found = concatenate(*finest)
-    assert float((found.means - matched(found, whole).means).abs().max()) < 1e-3
+    leaves = concatenate(*finest)
+    assert float((leaves.means - matched(leaves, whole).means).abs().max()) < 1e-3
     tiles = sum(path.stat().st_size for path in written.parent.glob("tiles/*.glb"))
     assert registry.size(written) == written.stat().st_size + tiles
 
@@ -124,9 +124,9 @@ def test_it_lies_where_the_frame_of_the_model_says(tmp_path: Path) -> None:
     root = json.loads((tmp_path / "out/tileset.json").read_text())["root"]
     transform = np.array(root["transform"]).reshape(4, 4).T
     for x, y, z in scene.means[:5].double().numpy():
-        found = (transform @ [x, z, -y, 1])[:3]
+        point = (transform @ [x, z, -y, 1])[:3]
         place = geodesy.place(np.array([100 + x, 300 + z, 20 - y]), MUNICH)
-        np.testing.assert_allclose(found, geodesy.to_earth_centered(place)[:3, 3], atol=1e-6)
+        np.testing.assert_allclose(point, geodesy.to_earth_centered(place)[:3, 3], atol=1e-6)
 
 
 @pytest.mark.parametrize("degree", [0, 3])
@@ -138,10 +138,10 @@ def test_without_a_place_it_stands_upright_in_its_own_coordinates(tmp_path: Path
     root = json.loads(path.read_text())["root"]
     transform = np.array(root["transform"]).reshape(4, 4).T
     # CesiumJS draws no Gaussians of a node that is rotated.
-    document, found, _ = _contents(tmp_path, root, tmp_path / "tile.spz")
+    document, gaussians, _ = _contents(tmp_path, root, tmp_path / "tile.spz")
     assert document["nodes"] == [{"mesh": 0}]
     assert len(document["meshes"][0]["primitives"][0]["attributes"]) == 4 + (degree + 1) ** 2 - 1
-    assert found.count == 50
+    assert gaussians.count == 50
     # The world of the model has z up, as tiles have.
     for mean in scene.means[:5].double().numpy():
         shown = (transform @ [*(UPRIGHT @ mean), 1])[:3]

@@ -159,7 +159,7 @@ def test_from_afar_a_coarser_level_is_the_better_picture() -> None:
         assert all(torch.equal(a, b) for a, b in zip(one.gaussians, other.gaussians, strict=True))
 
     near = render(scene, _camera(512)).color.clamp(0, 1)
-    found = []
+    scores = []
     for size in (512, 128, 32):
         # The truth from afar is the mean of what stands in each pixel: that of the near picture.
         truth = near.reshape(size, 512 // size, size, 512 // size, 3).mean((1, 3))
@@ -167,10 +167,10 @@ def test_from_afar_a_coarser_level_is_the_better_picture() -> None:
             render(_whole(levels, number), _camera(size)).color.clamp(0, 1)
             for number in range(len(levels.levels))
         ]
-        found.append([psnr(float((color - truth).double().square().mean())) for color in shown])
+        scores.append([psnr(float((color - truth).double().square().mean())) for color in shown])
     # Level 0 has several Gaussians a pixel in the small pictures, each of them widened to the size of a pixel.
-    assert found[0][1] > 25
-    assert found[0][0] > found[0][1] > found[0][2] > found[0][3]
-    assert max(found[1]) == found[1][1] > 24.8
-    assert max(found[2]) == found[2][2] > 18.4
-    assert found[2][2] > found[2][1] > found[2][0]
+    assert scores[0][1] > 25
+    assert scores[0][0] > scores[0][1] > scores[0][2] > scores[0][3]
+    assert max(scores[1]) == scores[1][1] > 24.8
+    assert max(scores[2]) == scores[2][2] > 18.4
+    assert scores[2][2] > scores[2][1] > scores[2][0]

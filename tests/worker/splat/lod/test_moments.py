@@ -26,10 +26,10 @@ def test_gaussians_survive_as_moments() -> None:
     assert torch.allclose(
         _full(moments_of(back).shapes.covariances), _full(moments_of(scene).shapes.covariances), rtol=1e-5
     )
-    found = differences(back, scene)
-    assert found["means"] == 0
-    assert found["opacities"] < 1e-6
-    assert found["dc"] == 0
+    errors = differences(back, scene)
+    assert errors["means"] == 0
+    assert errors["opacities"] < 1e-6
+    assert errors["dc"] == 0
     assert torch.allclose(back.log_scales.sort(1).values, scene.log_scales.sort(1).values, atol=1e-5)
 
 
@@ -80,11 +80,11 @@ def test_an_opacity_is_the_mass_over_the_area_and_ends_under_one() -> None:
     scene.means[1], scene.log_scales[1], scene.quats[1] = scene.means[0], scene.log_scales[0], scene.quats[0]
     scene.logit_opacities[:] = torch.logit(torch.tensor([0.2, 0.3]))
     both = (torch.tensor([0]), torch.tensor([1]))
-    found = torch.sigmoid(gaussians_of(merged(moments_of(scene), *both)).logit_opacities)
-    assert torch.allclose(found, torch.tensor([0.5]), atol=1e-5)
+    opacity = torch.sigmoid(gaussians_of(merged(moments_of(scene), *both)).logit_opacities)
+    assert torch.allclose(opacity, torch.tensor([0.5]), atol=1e-5)
     scene.logit_opacities[:] = torch.logit(torch.tensor([0.9, 0.8]))
-    found = torch.sigmoid(gaussians_of(merged(moments_of(scene), *both)).logit_opacities)
-    assert torch.allclose(found, torch.tensor([moments.MOST_OPAQUE]), atol=1e-5)
+    opacity = torch.sigmoid(gaussians_of(merged(moments_of(scene), *both)).logit_opacities)
+    assert torch.allclose(opacity, torch.tensor([moments.MOST_OPAQUE]), atol=1e-5)
 
 
 def test_flat_gaussians_have_an_area_and_axes() -> None:

@@ -37,11 +37,11 @@ TEXTS = {
 
 def levels() -> list[tuple[str, Any]]:
     """Each option with each of its values, or with its ends where these are numbers."""
-    found: list[tuple[str, Any]] = []
+    rows: list[tuple[str, Any]] = []
     for option in describe_options():
         values = TEXTS.get(option.name) or option.choices or (option.minimum, option.maximum)
-        found += [(option.name, value) for value in values]
-    return found
+        rows += [(option.name, value) for value in values]
+    return rows
 
 
 PAIRS = [
@@ -58,10 +58,10 @@ IN_ONE_PIECE: dict[str, set[object]] = {
 """What is for a training in one piece: the plan of a training knows nothing of tiles."""
 
 
-def excluded(given: Mapping[str, Any]) -> set[str]:
+def excluded(values: Mapping[str, Any]) -> set[str]:
     """The names of the options that the schema refuses for each other."""
     try:
-        TrainOptions.model_validate(given)
+        TrainOptions.model_validate(values)
     except ValidationError as error:
         return {str(entry["loc"][0]) for entry in error.errors() if entry["type"] == CONFLICT}
     return set()
@@ -72,11 +72,11 @@ def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(splatmill.schema.options, "check_conflicts", lambda options: None)
 
 
-def refused_by_plan(given: Mapping[str, Any]) -> bool:
+def refused_by_plan(values: Mapping[str, Any]) -> bool:
     """Whether no plan can be made of these options, of photos for which one can be made of each alone."""
-    options = TrainOptions.model_validate(given)
-    if "tiles" in given:
-        return any(value in IN_ONE_PIECE.get(name, ()) for name, value in given.items())
+    options = TrainOptions.model_validate(values)
+    if "tiles" in values:
+        return any(value in IN_ONE_PIECE.get(name, ()) for name, value in values.items())
     facts = changed(
         sky_share=0.3, seconds_left=options.within, start=MODEL if options.start in MODELS[:-1] else None
     )
@@ -97,13 +97,13 @@ def test_no_option_is_refused_alone() -> None:
 
 @pytest.mark.slow
 def test_the_pairs_that_have_no_plan_are_refused_by_the_schema_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    refused = {number: excluded(given) for number, given in enumerate(PAIRS)}
+    refused = {number: excluded(pair) for number, pair in enumerate(PAIRS)}
     monkeypatch.setattr(splatmill.schema.options, "check_conflicts", lambda options: None)
-    found = set()
-    for number, given in enumerate(PAIRS):
-        assert refused[number] == (set(given) if refused_by_plan(given) else set()), given
-        found |= {frozenset(refused[number])}
-    assert found - {frozenset()} == {frozenset(each.names) for each in CONFLICTS}
+    conflicts = set()
+    for number, pair in enumerate(PAIRS):
+        assert refused[number] == (set(pair) if refused_by_plan(pair) else set()), pair
+        conflicts |= {frozenset(refused[number])}
+    assert conflicts - {frozenset()} == {frozenset(each.names) for each in CONFLICTS}
 
 
 @pytest.mark.parametrize("start", POINTS)

@@ -34,30 +34,30 @@ def darkened(views: list[TrainingView], gains: tuple[float, float, float]) -> No
 
 def test_photos_that_agree_are_said_to_agree() -> None:
     world, views = sparse_scene()
-    seen = facts(world, views)
-    assert seen.exposure_spread is not None
-    assert seen.tint_spread is not None
-    assert seen.exposure_spread < 0.05
-    assert seen.tint_spread < 0.05
+    result = facts(world, views)
+    assert result.exposure_spread is not None
+    assert result.tint_spread is not None
+    assert result.exposure_spread < 0.05
+    assert result.tint_spread < 0.05
 
 
 def test_exposures_are_measured_in_logs() -> None:
     world, views = sparse_scene()
     darkened(views, (0.6, 0.6, 0.6))
-    seen = facts(world, views)
-    assert seen.exposure_spread is not None
-    assert seen.tint_spread is not None
+    result = facts(world, views)
+    assert result.exposure_spread is not None
+    assert result.tint_spread is not None
     # Half of the photos are log(0.6) apart from the other half; the robust deviation of that is 1.4826 halves of it.
-    assert 0.25 < seen.exposure_spread < 0.8
-    assert seen.tint_spread < 0.06
+    assert 0.25 < result.exposure_spread < 0.8
+    assert result.tint_spread < 0.06
 
 
 def test_white_balance_is_apart_from_exposure() -> None:
     world, views = sparse_scene()
     darkened(views, (1.0, 0.8, 0.65))
-    seen = facts(world, views)
-    assert seen.tint_spread is not None
-    assert seen.tint_spread > 0.12
+    result = facts(world, views)
+    assert result.tint_spread is not None
+    assert result.tint_spread > 0.12
 
 
 def test_errors_and_lenses_are_in_pixels_of_the_training_size() -> None:
@@ -69,12 +69,12 @@ def test_errors_and_lenses_are_in_pixels_of_the_training_size() -> None:
         point_errors=np.full(len(world.points), 2.0),
         views=tuple(replace(view, lens=lens) for view in world.views),
     )
-    seen = facts(bent, views)
-    assert seen.reprojection == pytest.approx(0.5)
+    result = facts(bent, views)
+    assert result.reprojection == pytest.approx(0.5)
     # k r^3 at the corner, r = 240 / 300 focal lengths from the centre; a quarter of it at the training size.
     corner = np.hypot(size / 2, 3 * size / 8) / 300.0
-    assert seen.lens_residual == pytest.approx(0.1 * corner**3 * 300.0 / 4, rel=1e-6)
-    assert seen.distorted == len(views)
+    assert result.lens_residual == pytest.approx(0.1 * corner**3 * 300.0 / 4, rel=1e-6)
+    assert result.distorted == len(views)
     assert facts(world, views).lens_residual is None
 
 
@@ -111,26 +111,26 @@ def test_errors_that_are_not_known_do_not_count() -> None:
 
 def test_what_points_leave_open_is_measured() -> None:
     world, views = sparse_scene()
-    seen = facts(world, views)
-    assert seen.sightings is not None
-    assert seen.gap_share is not None
-    assert seen.sky_share is not None
-    assert seen.sightings > 50
-    assert seen.extent is not None
-    assert 0.2 < seen.extent < 3.0
-    assert 0.05 < seen.gap_share < 0.95
-    assert seen.gap_points > 100
-    assert seen.shell_points > 100
-    assert seen.shell_distance is not None
-    assert seen.shell_distance > 4.0
-    assert 0.0 <= seen.sky_share < 0.4
+    result = facts(world, views)
+    assert result.sightings is not None
+    assert result.gap_share is not None
+    assert result.sky_share is not None
+    assert result.sightings > 50
+    assert result.extent is not None
+    assert 0.2 < result.extent < 3.0
+    assert 0.05 < result.gap_share < 0.95
+    assert result.gap_points > 100
+    assert result.shell_points > 100
+    assert result.shell_distance is not None
+    assert result.shell_distance > 4.0
+    assert 0.0 <= result.sky_share < 0.4
 
 
 def test_nothing_is_said_where_nothing_can_be_known() -> None:
     world, views = sparse_scene()
     bare = replace(world, points=world.points[:3], colors=world.colors[:3], point_views=None)
-    seen = facts(bare, views)
-    assert (seen.exposure_spread, seen.tint_spread, seen.gap_share, seen.sky_share) == (None,) * 4
+    result = facts(bare, views)
+    assert (result.exposure_spread, result.tint_spread, result.gap_share, result.sky_share) == (None,) * 4
     assert facts(world, still_life.training_views(alpha=True)).gap_share is None
 
 
@@ -166,14 +166,14 @@ def test_equal_exposures_agree_and_unequal_ones_do_not() -> None:
 
 def test_geometry_is_measured() -> None:
     scene, views = tracked(np.ones(len(still_life.scene().views)))
-    seen = facts(scene, views, 2)
-    assert seen.view_angle is not None
-    assert 20.0 < seen.view_angle < 180.0
-    assert seen.distance_ratio is not None
-    assert 1.0 <= seen.distance_ratio < 4.0
-    assert (seen.views, seen.held_out, seen.width, seen.height) == (14, 2, 96, 72)
+    result = facts(scene, views, 2)
+    assert result.view_angle is not None
+    assert 20.0 < result.view_angle < 180.0
+    assert result.distance_ratio is not None
+    assert 1.0 <= result.distance_ratio < 4.0
+    assert (result.views, result.held_out, result.width, result.height) == (14, 2, 96, 72)
     directions = np.array([view.full.camera.viewmat[2, :3] for view in views])
-    assert seen.alignment == pytest.approx(float(np.sqrt((directions @ directions.T).mean())))
+    assert result.alignment == pytest.approx(float(np.sqrt((directions @ directions.T).mean())))
     without = facts(still_life.scene(), still_life.training_views())
     assert without.exposure_spread is None
     assert without.view_angle is None

@@ -59,8 +59,8 @@ def test_other_kernels_cannot_be_asked_for_it(kernels: ops.Backend) -> None:
 
 def test_the_share_in_view_is_that_of_the_points_within_the_frame() -> None:
     world, views = sparse_scene()
-    seen = measure(world, views, 0, None)[0].coverage
-    assert seen is not None
+    coverage = measure(world, views, 0, None)[0].coverage
+    assert coverage is not None
     shares = [view.full.camera.project(world.points).inside.mean() for view in views]
-    assert seen.in_view == pytest.approx(float(np.median(shares)), abs=0.05)
-    assert 0.0 < seen.in_view <= 1.0
+    assert coverage.in_view == pytest.approx(float(np.median(shares)), abs=0.05)
+    assert 0.0 < coverage.in_view <= 1.0

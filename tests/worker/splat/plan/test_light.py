@@ -36,11 +36,11 @@ def light(gains: np.ndarray) -> Light:
 
 
 def light_of(scene: Scene, views: list[TrainingView]) -> Light:
-    seen = Observations.of(scene, views)
-    assert seen is not None
-    found = compared(seen, views)
-    assert found is not None
-    return found
+    observations = Observations.of(scene, views)
+    assert observations is not None
+    lighting = compared(observations, views)
+    assert lighting is not None
+    return lighting
 
 
 def ring(photos: int) -> list[TrainingView]:
@@ -61,7 +61,7 @@ def on_a_ring(photos: int, exposures: np.ndarray) -> Light:
     grey = np.linspace(70.0, 110.0, points)
     color = (grey[None, :, None] * np.exp(exposures)[:, None, :] + 0.5).astype(np.uint8)
     directions = np.zeros((photos * points, 3))
-    seen = Observations(
+    observations = Observations(
         points,
         photos,
         np.tile(np.arange(points), photos),
@@ -70,25 +70,25 @@ def on_a_ring(photos: int, exposures: np.ndarray) -> Light:
         np.ones(photos * points),
         directions,
     )
-    found = compared(seen, ring(photos))
-    assert found is not None
-    return found
+    lighting = compared(observations, ring(photos))
+    assert lighting is not None
+    return lighting
 
 
 def test_equal_light_departs_by_less_than_the_noise() -> None:
-    found = light(np.ones((14, 3)))
-    assert found.tail < 3 * found.error + 0.03
-    assert np.abs(found.exposures.mean(axis=0)).max() < 1e-9
-    assert np.abs(found.departures.mean(axis=0)).max() < 1e-9
+    lighting = light(np.ones((14, 3)))
+    assert lighting.tail < 3 * lighting.error + 0.03
+    assert np.abs(lighting.exposures.mean(axis=0)).max() < 1e-9
+    assert np.abs(lighting.departures.mean(axis=0)).max() < 1e-9
 
 
 def test_planted_exposures_and_tints_are_recovered() -> None:
     planted = PlantedLight(exposures=0.25, tints=0.1).gains(14, seed=3)
     planted /= planted.max()  # nothing is clipped
-    found = light(planted).exposures - light(np.ones((14, 3))).exposures
+    exposures = light(planted).exposures - light(np.ones((14, 3))).exposures
     log = np.log(planted)
     # 8-bit values of about 80 levels are rounded by 0.3 levels rms, 0.4 %; with some hundred points, far less is left.
-    assert np.abs(found - (log - log.mean(axis=0))).max() < 0.03
+    assert np.abs(exposures - (log - log.mean(axis=0))).max() < 0.03
 
 
 def test_light_that_follows_the_camera_is_left_in_and_a_jump_is_taken_out() -> None:
@@ -108,7 +108,7 @@ def test_what_photos_tell_of_one_another_falls_with_their_distance() -> None:
     """By a simulation of the same light: what the best linear prediction from all other photos leaves."""
     assert on_a_ring(36, np.zeros((36, 3))).unseen < 0.02
     assert on_a_ring(4, np.zeros((4, 3))).unseen > 0.95
-    found = on_a_ring(12, np.zeros((12, 3)))
+    lighting = on_a_ring(12, np.zeros((12, 3)))
     rng = np.random.default_rng(0)
     turns = 2 * np.pi * np.arange(12) / 12
     # Places and directions lie on the same circle, so that squared distances count twice.
@@ -119,16 +119,16 @@ def test_what_photos_tell_of_one_another_falls_with_their_distance() -> None:
     rest = others - others.mean(axis=1, keepdims=True)
     target = values[:, 0] - others.mean(axis=1)
     left = target - rest @ np.linalg.lstsq(rest, target, rcond=None)[0]
-    assert found.unseen == pytest.approx(left.var(), rel=0.05)
+    assert lighting.unseen == pytest.approx(left.var(), rel=0.05)
 
 
 def test_exposures_drawn_apart_are_taken_out_whole() -> None:
     drawn = np.repeat(0.3 * np.random.default_rng(1).standard_normal(36)[:, None], 3, axis=1)
-    found = on_a_ring(36, drawn)
-    wanted = drawn - drawn.mean(axis=0)
+    lighting = on_a_ring(36, drawn)
+    departures = drawn - drawn.mean(axis=0)
     # Each photo is predicted by the mean of the 35 others; 60 values of 8 bits leave far less than a percent.
-    assert np.abs(found.departures - wanted * 36 / 35).max() < 0.01
-    assert found.tail > 0.3
+    assert np.abs(lighting.departures - departures * 36 / 35).max() < 0.01
+    assert lighting.tail > 0.3
 
 
 def test_a_photo_that_shows_too_little_keeps_its_light() -> None:
@@ -138,10 +138,10 @@ def test_a_photo_that_shows_too_little_keeps_its_light() -> None:
     kept = np.flatnonzero(track != 5)
     counts = [int((track[a:b] != 5).sum()) for a, b in pairwise(offsets)]
     scene = Scene(**{**vars(world), "point_views": PointViews(np.cumsum([0, *counts]), track[kept])})
-    found = light_of(scene, views)
-    assert np.isinf(found.errors[5])
-    assert (found.departures[5] == 0).all()
-    assert np.isfinite(found.tail)
+    lighting = light_of(scene, views)
+    assert np.isinf(lighting.errors[5])
+    assert (lighting.departures[5] == 0).all()
+    assert np.isfinite(lighting.tail)
 
 
 def test_without_tracks_light_cannot_be_compared() -> None:

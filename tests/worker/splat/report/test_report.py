@@ -161,12 +161,12 @@ def test_photos_that_disagree_are_ranked_with_the_reason(tmp_path: Path) -> None
     nowhere = torch.zeros(36, 48, dtype=torch.bool)
     patch = nowhere.clone()
     patch[5:15, 10:30] = True
-    found = (
+    disagreements = (
         Disagreement("01.png", 9.5, 0.116, "moving things", patch),
         Disagreement("02.png", 4.0, 0.0, "other light", nowhere),
         Disagreement("00.png", 0.1, 0.0, None, nowhere),
     )
-    result = replace(trained([30.0, 20.0, 30.0, 30.0, 29.0], True), disagreements=found)
+    result = replace(trained([30.0, 20.0, 30.0, 30.0, 29.0], True), disagreements=disagreements)
     report = report_of(tmp_path, result)
     assert report["disagreement"][0] == {
         "photo": "01.png",
@@ -193,8 +193,8 @@ def test_json_gets_plain_values() -> None:
 
 
 def test_where_the_cameras_are_wrong_no_photo_is_accused_of_another_light(tmp_path: Path) -> None:
-    found = (Disagreement("02.png", 4.0, 0.0, "other light", torch.zeros(2, 2, dtype=torch.bool)),)
-    result = replace(trained([30.0, 30.0, 12.0, 30.0, 29.0], True), disagreements=found)
+    disagreements = (Disagreement("02.png", 4.0, 0.0, "other light", torch.zeros(2, 2, dtype=torch.bool)),)
+    result = replace(trained([30.0, 30.0, 12.0, 30.0, 29.0], True), disagreements=disagreements)
     for contradicted in (False, True):
         report = report_of(tmp_path, result, said={"cameras_contradicted": contradicted})
         (misfit,) = (each["why"] for each in report["misfits"] if each["photo"] == "02.png")

@@ -44,10 +44,10 @@ def test_masked_pixels_do_not_count_in_colour_and_use() -> None:
 
 def test_views_have_the_points_of_their_tracks_or_all_of_them() -> None:
     world, views = sparse_scene()
-    seen = visible_points(world, views)
+    clouds = visible_points(world, views)
     assert world.point_views is not None
-    assert sum(map(len, seen)) == len(world.point_views.views)
-    for view, points in zip(views, seen, strict=True):
+    assert sum(map(len, clouds)) == len(world.point_views.views)
+    for view, points in zip(views, clouds, strict=True):
         assert view.full.camera.project(points).inside.all()
     untracked = replace(world, point_views=None)
     assert all(len(points) == len(world.points) for points in visible_points(untracked, views))

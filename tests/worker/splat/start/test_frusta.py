@@ -30,8 +30,8 @@ def test_opaque_photos_start_where_most_cameras_look() -> None:
     targets = [view.full for view in still_life.training_views()]
     points, colors = frusta.sample_frusta(targets, 500, 0)
     assert points.shape == colors.shape == (500, 3)
-    seen = sum(target.camera.project(points.double().numpy()).inside.astype(int) for target in targets)
-    assert float(np.median(seen)) > 0.7 * len(targets)
+    counts = sum(target.camera.project(points.double().numpy()).inside.astype(int) for target in targets)
+    assert float(np.median(counts)) > 0.7 * len(targets)
     again, _ = frusta.sample_frusta(targets, 500, 0)
     assert torch.equal(again, points)
     assert not torch.equal(frusta.sample_frusta(targets, 500, 1)[0], points)

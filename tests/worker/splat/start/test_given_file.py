@@ -33,7 +33,7 @@ pytestmark = [
 ]
 
 
-def given(path: Path, most: int = 10**6) -> tuple[Gaussians, int]:
+def read_model(path: Path, most: int = 10**6) -> tuple[Gaussians, int]:
     start = read_given_model(path, Normalization(1.0, np.zeros(3)), most)
     return start.gaussians, start.count
 
@@ -53,7 +53,7 @@ def test_the_attempt_itself_reads_no_byte_of_a_model(folder: Path, monkeypatch: 
     expected = registry.read(folder / "m.ply").gaussians
     waiting = children()
     monkeypatch.setattr(registry, "read", forbidden)
-    gaussians, count = given(folder / "m.ply")
+    gaussians, count = read_model(folder / "m.ply")
     assert count == 300
     for value, same in zip(gaussians, expected, strict=True):
         assert torch.equal(value, same)
@@ -63,7 +63,7 @@ def test_the_attempt_itself_reads_no_byte_of_a_model(folder: Path, monkeypatch: 
 def test_a_larger_model_is_reduced_before_it_reaches_the_attempt(folder: Path) -> None:
     registry.write(folder / "m.ply", some_gaussians(300, 1))
     expected = registry.read(folder / "m.ply").gaussians
-    gaussians, count = given(folder / "m.ply", most=20)
+    gaussians, count = read_model(folder / "m.ply", most=20)
     assert (gaussians.count, count) == (20, 300)
     kept = expected.logit_opacities.sort(descending=True).values[:20]
     assert torch.equal(gaussians.logit_opacities.sort(descending=True).values, kept)
@@ -82,7 +82,7 @@ def test_what_would_fill_the_memory_is_refused(folder: Path, what: str) -> None:
     Path("/proc/self/clear_refs").write_text("5")
     before = status("VmRSS")
     with pytest.raises(StartUnusable, match=rf"m\{suffix} could not be read as a SOG model"):
-        given(folder / f"m{suffix}")
+        read_model(folder / f"m{suffix}")
     assert status("VmHWM") - before < 50 * 10**6
 
 
@@ -100,12 +100,12 @@ def test_a_model_whose_processes_are_killed_is_not_called_unusable(folder: Path)
     killer.start()
     try:
         with pytest.raises(WorkerError) as error:
-            given(folder / "m.ply")
+            read_model(folder / "m.ply")
     finally:
         done.set()
         killer.join()
     assert error.value.code == "decoder_ended"  # which the service tries again
-    assert given(folder / "m.ply")[1] == 300
+    assert read_model(folder / "m.ply")[1] == 300
 
 
 def status(name: str) -> int:

@@ -74,9 +74,9 @@ def photos(body: Body, count: int = 40) -> list[Target]:
 
 
 def hull_of(targets: list[Target], most: int = MOST) -> Hull:
-    found = visual_hull(targets, most)
-    assert isinstance(found, Hull), found
-    return found
+    hull = visual_hull(targets, most)
+    assert isinstance(hull, Hull), hull
+    return hull
 
 
 def directions(count: int = 100) -> np.ndarray:
@@ -182,9 +182,9 @@ def inverted(targets: list[Target]) -> list[Target]:
 def test_outlines_that_bound_nothing_are_refused_with_the_reason(
     targets: Callable[[], list[Target]], reason: str
 ) -> None:
-    found = visual_hull(targets(), MOST)
-    assert isinstance(found, NoHull)
-    assert reason in found.reason
+    refusal = visual_hull(targets(), MOST)
+    assert isinstance(refusal, NoHull)
+    assert reason in refusal.reason
 
 
 def test_outlines_that_contradict_one_another_are_refused() -> None:
@@ -196,8 +196,8 @@ def test_outlines_that_contradict_one_another_are_refused() -> None:
 
     moved = [photo(camera, elsewhere(place)) for camera, place in zip(around(12), places, strict=True)]
     assert isinstance(visual_hull(targets, MOST), Hull)
-    found = visual_hull(moved, MOST)
-    assert isinstance(found, NoHull)
+    refusal = visual_hull(moved, MOST)
+    assert isinstance(refusal, NoHull)
 
 
 def test_the_first_gaussians_leave_room_for_those_that_training_adds() -> None:

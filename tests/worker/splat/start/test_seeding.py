@@ -22,13 +22,13 @@ def test_what_is_added_keeps_to_the_limit_and_to_what_the_plan_says() -> None:
         first, world, views, fill_gaps=False, add_far_shell=False, max_gaussians=10**6
     )
     assert nothing is first
-    wanted = len(gaps.gap_points(cells_of(world, views))[0])
+    count = len(gaps.gap_points(cells_of(world, views))[0])
     parts: list[str] = []
     whole = seeding.add_seeds(
         first, world, views, fill_gaps=True, add_far_shell=False, max_gaussians=10**6, tell=parts.append
     )
     assert parts == ["filling gaps between the points"]
-    assert whole.count == first.count + wanted
+    assert whole.count == first.count + count
     assert bool(whole.finite().all())
     cells = cells_of(world, views)
     seeds = seeding.Seeds(far_shell.shell_points(cells, world.points), gaps.gap_points(cells))

@@ -25,13 +25,13 @@ Spoil = Callable[[int, torch.Tensor], None]
 def glances(spoil: Spoil) -> list[Glance]:
     """All photos with their true depths, and residuals of 0.01 that `spoil` changes."""
     scale = Normalization.of(still_life.scene()).scale
-    seen = []
+    looks = []
     for number, view in enumerate(still_life.training_views()):
         depth = scale * torch.from_numpy(still_life.pictures()[number][2])
         residual = torch.full(depth.shape, 0.01)
         spoil(number, residual)
-        seen.append(Glance(view.full, residual, depth, torch.ones_like(depth, dtype=torch.bool), 0.0))
-    return seen
+        looks.append(Glance(view.full, residual, depth, torch.ones_like(depth, dtype=torch.bool), 0.0))
+    return looks
 
 
 def test_what_one_photo_alone_shows_is_an_outlier_with_its_border() -> None:
@@ -39,14 +39,14 @@ def test_what_one_photo_alone_shows_is_an_outlier_with_its_border() -> None:
         if number == 5:
             residual[40:50, 40:52] = 0.2
 
-    found = compared(glances(spoil))
+    comparisons = compared(glances(spoil))
     inside = torch.zeros(72, 96, dtype=torch.bool)
     inside[39:51, 39:53] = True
-    assert float(found[5].outliers[40:50, 40:52].float().mean()) > 0.9
-    assert not bool((found[5].outliers & ~inside).any())
-    assert all(not bool(each.outliers.any()) for number, each in enumerate(found) if number != 5)
-    assert found[5].decibels > 5.0
-    assert max(each.decibels for number, each in enumerate(found) if number != 5) < 1.0
+    assert float(comparisons[5].outliers[40:50, 40:52].float().mean()) > 0.9
+    assert not bool((comparisons[5].outliers & ~inside).any())
+    assert all(not bool(each.outliers.any()) for number, each in enumerate(comparisons) if number != 5)
+    assert comparisons[5].decibels > 5.0
+    assert max(each.decibels for number, each in enumerate(comparisons) if number != 5) < 1.0
 
 
 def test_what_is_hard_in_every_photo_is_none() -> None:
@@ -59,10 +59,10 @@ def test_what_is_hard_in_every_photo_is_none() -> None:
         near = np.linalg.norm(places, axis=1).reshape(depth.shape) < 1.0
         residual[torch.from_numpy(near)] = 0.2
 
-    hard = sum(int((seen.residual > 0.1).sum()) for seen in glances(spoil))
-    found = sum(int(each.outliers.sum()) for each in compared(glances(spoil)))
+    hard = sum(int((look.residual > 0.1).sum()) for look in glances(spoil))
+    outliers = sum(int(each.outliers.sum()) for each in compared(glances(spoil)))
     assert hard > 5000
-    assert found < 0.01 * hard
+    assert outliers < 0.01 * hard
 
 
 def test_single_pixels_are_none() -> None:
@@ -79,12 +79,12 @@ def test_what_no_two_others_show_is_none() -> None:
             residual[40:50, 40:52] = 0.2
 
     blind = [
-        replace(seen, depth=seen.depth * (1.0 if number == 5 else 3.0))
-        for number, seen in enumerate(glances(spoil))
+        replace(look, depth=look.depth * (1.0 if number == 5 else 3.0))
+        for number, look in enumerate(glances(spoil))
     ]
-    found = compared(blind)[5]
-    assert not bool(found.outliers.any())
-    assert float(torch.isnan(found.ratio).float().mean()) > 0.95
+    comparison = compared(blind)[5]
+    assert not bool(comparison.outliers.any())
+    assert float(torch.isnan(comparison.ratio).float().mean()) > 0.95
 
 
 def test_light_is_fitted_and_no_disagreement() -> None:
@@ -120,6 +120,6 @@ def test_photos_are_compared_small(width: int, height: int) -> None:
 
 
 def test_neighbours_are_the_nearest_cameras() -> None:
-    found = neighbours([view.full for view in still_life.training_views()])
-    assert all(len(others) == 6 and number not in others for number, others in enumerate(found))
-    assert {4, 6} <= set(found[5])
+    nearest = neighbours([view.full for view in still_life.training_views()])
+    assert all(len(others) == 6 and number not in others for number, others in enumerate(nearest))
+    assert {4, 6} <= set(nearest[5])

@@ -30,13 +30,13 @@ def test_what_passes_by_is_found_in_the_photos_that_show_it() -> None:
     views = still_life.training_views()
     for number in (3, 8):
         views[number].full.rgb[30:50, 36:60] = torch.tensor([250, 20, 220], dtype=torch.uint8)
-    found = judged(views)
-    assert len(found) == len(views)
-    assert {each.name for each in found[:2]} == {views[number].name for number in (3, 8)}
-    for each in found[:2]:
+    ranking = judged(views)
+    assert len(ranking) == len(views)
+    assert {each.name for each in ranking[:2]} == {views[number].name for number in (3, 8)}
+    for each in ranking[:2]:
         assert each.reason == "moving things"
         assert float(each.outliers[32:48, 38:58].float().mean()) > 0.8
-    assert [each.decibels for each in found] == sorted((each.decibels for each in found), reverse=True)
+    assert [each.decibels for each in ranking] == sorted((each.decibels for each in ranking), reverse=True)
 
 
 def test_other_light_is_told_from_another_camera() -> None:
@@ -68,8 +68,8 @@ def test_an_opaque_photo_among_cut_outs_is_not_blamed_for_its_light(
         disagreement, "compared", lambda glances: [Comparison(flat, 0.0, flat > 0.0, -1.0) for _ in glances]
     )
     run = TrainingRun(first_engine(), plan(30), views, 1.1)
-    found = disagreement.disagreements(run, range(len(views)))
-    assert {each.reason for each in found if each.name == views[-1].name} == {reason}
+    ranking = disagreement.disagreements(run, range(len(views)))
+    assert {each.reason for each in ranking if each.name == views[-1].name} == {reason}
 
 
 @pytest.mark.parametrize(
@@ -84,12 +84,12 @@ def test_a_photo_that_is_hardly_worse_has_no_wrong_camera(
     def compared(glances: Sequence[Glance]) -> list[Comparison]:
         return [
             Comparison(
-                ratio=torch.ones(seen.residual.shape),
+                ratio=torch.ones(glance.residual.shape),
                 median=1.5 if number == 4 else 1.0,
-                outliers=torch.zeros(seen.residual.shape, dtype=torch.bool),
+                outliers=torch.zeros(glance.residual.shape, dtype=torch.bool),
                 decibels=decibels if number == 4 else -1.0,
             )
-            for number, seen in enumerate(glances)
+            for number, glance in enumerate(glances)
         ]
 
     monkeypatch.setattr(disagreement, "compared", compared)
@@ -122,10 +122,10 @@ def test_photos_are_compared_once_before_they_are_learnt_by_heart(
 def test_photos_that_are_set_aside_are_not_compared() -> None:
     """They are not learnt when the others are compared, which is no disagreement."""
     views = still_life.training_views()
-    found = train(first_engine(), views, [], replace(plan(40), validation=2), extent=1.1)
-    assert len(found.validation) == 2
-    assert {each.name for each in found.disagreements} == {view.name for view in views} - set(
-        found.validation
+    result = train(first_engine(), views, [], replace(plan(40), validation=2), extent=1.1)
+    assert len(result.validation) == 2
+    assert {each.name for each in result.disagreements} == {view.name for view in views} - set(
+        result.validation
     )
 
 

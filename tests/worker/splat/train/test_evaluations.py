@@ -64,10 +64,10 @@ def test_the_last_point_shows_all_held_out_views_and_is_the_result() -> None:
     views = still_life.training_views()
     gaussians = from_points(*still_life.points())
     plan = decide(replace(FACTS, views=8, held_out=6), TrainOptions(steps=12), "cpu")
-    seen: list[int | None] = []
+    counts: list[int | None] = []
     trained = train(open_engine(gaussians, "cpu"), views[6:], views[:6], plan, extent=1.1)
-    seen = [point.views for point in trained.curve]
-    assert seen == [4] * (len(SHORT_EVALUATED_AT) - 1) + [6]
+    counts = [point.views for point in trained.curve]
+    assert counts == [4] * (len(SHORT_EVALUATED_AT) - 1) + [6]
     assert trained.held_out is not None
     assert [view.name for view in trained.held_out.views] == [view.name for view in views[:6]]
     assert trained.curve[-1].psnr == trained.held_out.psnr

@@ -25,7 +25,7 @@ def test_a_rise_of_the_smoothed_loss_is_a_divergence() -> None:
     with pytest.raises(TrainingFailed) as failed:
         watched(health, 51, [1.0] * 50)
     assert failed.value.name is FailureName.divergence
-    assert "from 0.100 to" in failed.value.seen
+    assert "from 0.100 to" in failed.value.symptom
 
 
 def test_one_bad_photo_is_no_divergence_and_no_moment_for_a_snapshot() -> None:

@@ -102,7 +102,7 @@ def test_cameras_do_not_move_together() -> None:
             poses.update(i, torch.randn(6, generator=random) + 1.0, 0.5, 1.0)
     assert float(poses.twists.abs().max()) > 0.0
     units = torch.cat([torch.full((3,), poses.depth), torch.ones(3)]).double()
-    weighed = gauge(poses.given) / units.repeat(len(views))[:, None]
+    weighed = gauge(poses.viewmats) / units.repeat(len(views))[:, None]
     common = torch.linalg.lstsq(weighed, (poses.twists / units).reshape(-1, 1)).solution
     assert float(common.abs().max()) < 1e-12
 

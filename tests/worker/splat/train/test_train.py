@@ -247,7 +247,7 @@ def test_a_cancel_is_seen_at_the_next_step() -> None:
     assert next(asked) == 8
 
 
-class Seen:
+class PhotoLog:
     """An engine that keeps the numbers of the photos that steps were taken on."""
 
     def __init__(self, engine: Any) -> None:
@@ -268,7 +268,7 @@ def test_a_target_ends_the_run_by_photos_that_it_does_not_train_on() -> None:
         TrainingView(view.name, {1: view.full._replace(rgb=torch.zeros_like(view.full.rgb))})
         for view in held_out
     ]
-    engine = Seen(first_engine())
+    engine = PhotoLog(first_engine())
     trained = train(engine, views, black, plan(2000, target_psnr=15.0, validation=2), extent=1.1)
     assert trained.steps < 2000
     reached = trained.curve[-1].validation_psnr
@@ -295,7 +295,7 @@ def test_held_out_photos_reach_no_target() -> None:
 )
 def test_photos_set_aside_are_trained_on_after_the_last_decision(decides: dict[str, Any], last: int) -> None:
     views, held_out = split()
-    engine = Seen(first_engine())
+    engine = PhotoLog(first_engine())
     short = plan(200, **decides, validation=2, densify=False)
     trained = train(engine, views, held_out, short, extent=1.1)
     measured = [point.step for point in trained.curve if point.validation_psnr is not None]
@@ -333,7 +333,7 @@ def test_a_resumed_run_sets_the_same_photos_aside() -> None:
     middle = next(snapshot for snapshot in kept if snapshot.state.step == 100)
     late = next(snapshot for snapshot in kept if snapshot.state.step == 170)
     for snapshot, aside in ((middle, True), (late, False)):
-        engine = Seen(first_engine())
+        engine = PhotoLog(first_engine())
         resumed = train(engine, views, held_out, course, extent=1.1, resume_from=snapshot)
         assert resumed.validation == tuple(views[index].name for index in (3, 9))
         assert bool({3, 9} & set(engine.photos[:30])) is not aside

@@ -68,8 +68,8 @@ def test_photos_carry_what_the_receiver_measured_and_the_focal_length(
         assert tags.latitude is not None
         assert tags.longitude is not None
         assert tags.altitude is not None
-        found = np.array([[tags.latitude, tags.longitude, tags.altitude]])
-        assert np.abs(local(found) - local(expected[None])).max() < 0.01
+        place = np.array([[tags.latitude, tags.longitude, tags.altitude]])
+        assert np.abs(local(place) - local(expected[None])).max() < 0.01
         assert tags.focal_in_diagonals is not None
         assert tags.focal_in_diagonals * 43.267 == pytest.approx(35 * 0.75, abs=0.5)
 
@@ -78,10 +78,10 @@ def test_the_truth_is_a_colmap_model_beside_the_photos(flown: tuple[Path, dict[s
     folder, cameras = flown
     assert sorted(p.name for p in folder.iterdir()) == ["photos", "truth"]
     model = pycolmap.Reconstruction(folder / "truth")
-    found = {image.name: image.cam_from_world().matrix() for image in model.images.values()}
-    assert found.keys() == cameras.keys()
+    poses = {image.name: image.cam_from_world().matrix() for image in model.images.values()}
+    assert poses.keys() == cameras.keys()
     for name, camera in cameras.items():
-        assert np.abs(found[name] - camera.viewmat[:3]).max() < 1e-9
+        assert np.abs(poses[name] - camera.viewmat[:3]).max() < 1e-9
     (lens,) = model.cameras.values()
     assert lens.params.tolist() == [240.0, 240.0, 160.0, 120.0]
 

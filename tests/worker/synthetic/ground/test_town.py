@@ -80,10 +80,10 @@ def test_the_middle_of_a_roof_projects_to_the_pixel_that_is_as_far_away(town: To
     ]
     columns, rows, distance, inside = camera.project(np.array(tops))
     assert inside.sum() > 10
-    seen = depth[rows[inside].astype(int), columns[inside].astype(int)]
+    pixel_depths = depth[rows[inside].astype(int), columns[inside].astype(int)]
     # Half a pixel of a level roof, seen 45 degrees from straight down at most, is as deep as it is wide.
-    near = np.abs(seen - distance[inside]) < 0.5 * distance[inside] / camera.fx
-    nearer = seen < distance[inside]  # a crown or a cabin hides some
+    near = np.abs(pixel_depths - distance[inside]) < 0.5 * distance[inside] / camera.fx
+    nearer = pixel_depths < distance[inside]  # a crown or a cabin hides some
     assert near.mean() > 0.3
     assert (near | nearer).all()
 

@@ -84,12 +84,12 @@ def load(build: str) -> ctypes.CDLL:
 
 def errors(library: ctypes.CDLL, function: str, ranges: Iterable[tuple[int, int]], stride: int = 1) -> Errors:
     """The errors at every stride-th float of ranges of places."""
-    found = Errors()
+    totals = Errors()
     for first, end in ranges:
         for bits, count in runs(first, end, stride):
-            if not library.add_errors(function.encode(), bits, count, stride, ctypes.byref(found)):
+            if not library.add_errors(function.encode(), bits, count, stride, ctypes.byref(totals)):
                 raise ValueError(f"functions.cpp has no function {function!r}")
-    return found
+    return totals
 
 
 def measure(build: str, function: Function, stride: int = 1) -> dict[str, Any]:

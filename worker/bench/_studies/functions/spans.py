@@ -25,13 +25,13 @@ class Span:
 
     def parts(self, count: int) -> list[tuple[int, int]]:
         """About `count` ranges [first, end) of places, equally wide by value, that together are the span, in order."""
-        found = []
+        ranges = []
         for low, high in self.intervals:
             n = count // len(self.intervals)
             inner = [place(x) for x in np.linspace(low, high, n + 1)[1:-1]]
             edges = [place(low), *inner, place(high) + 1]
-            found += [(a, b) for a, b in pairwise(edges) if a < b]
-        return found
+            ranges += [(a, b) for a, b in pairwise(edges) if a < b]
+        return ranges
 
     @property
     def count(self) -> int:

@@ -72,8 +72,8 @@ def by_ops(
     if bins is None:
         bins = ops.bin(p, w, h, backend=backend)
     color, _, _ = ops.composite(p, bins, w, h, backend=backend)
-    found = torch.autograd.grad((color * weights.to(dtype)).sum(), [*leaves, xi])
-    gradients = dict(zip((*GROUPS, "pose"), found, strict=True))
+    slopes = torch.autograd.grad((color * weights.to(dtype)).sum(), [*leaves, xi])
+    gradients = dict(zip((*GROUPS, "pose"), slopes, strict=True))
     return Values(color.detach(), gradients), Projected(*(x.detach() for x in p)), bins
 
 
@@ -95,15 +95,15 @@ def state(scene: Scene, draws: int, seed: int = 0, exponents: float = 0.0) -> Pr
             return ops.project(*x.arrays(), x.viewmat, x.K, w, h, degree=3, backend="reference")
 
     def changed_scene() -> Scene:
-        found = scene.mapped(moved)
+        variant = scene.mapped(moved)
         if not exponents:
-            return found
+            return variant
 
         def argument(x: Tensor) -> Tensor:
             return x + (moved(torch.ones_like(x)) - 1) * x.abs().clamp_min(exponents)
 
         return replace(
-            found, log_scales=argument(scene.log_scales), logit_opacities=argument(scene.logit_opacities)
+            variant, log_scales=argument(scene.log_scales), logit_opacities=argument(scene.logit_opacities)
         )
 
     changed = [changed_scene() for _ in range(draws)]
@@ -138,8 +138,8 @@ def state(scene: Scene, draws: int, seed: int = 0, exponents: float = 0.0) -> Pr
 
     def pulled(totals: list[Tensor]) -> list[dict[str, Tensor]]:
         """The gradients of every total to the leaves and the motion."""
-        found = [torch.autograd.grad(x, fields, materialize_grads=True) for x in totals]
-        stacked = [torch.stack(x) for x in zip(*found, strict=True)]
+        per_total = [torch.autograd.grad(x, fields, materialize_grads=True) for x in totals]
+        stacked = [torch.stack(x) for x in zip(*per_total, strict=True)]
         pulled_back = torch.autograd.grad(
             projected[:5], [*leaves, xi], stacked, retain_graph=True, is_grads_batched=True
         )
@@ -183,8 +183,8 @@ def _reached(projected: list[Projected], width: int, height: int) -> Bins:
     lists = [ops.bin(p, width, height, backend="reference") for p in projected]
     ids, offsets = [], [0]
     for tile in range(len(lists[0].offsets) - 1):
-        found = {i for x in lists for i in x.ids[x.offsets[tile] : x.offsets[tile + 1]].tolist()}
-        every = torch.tensor(sorted(found), dtype=torch.int64)
+        present = {i for x in lists for i in x.ids[x.offsets[tile] : x.offsets[tile + 1]].tolist()}
+        every = torch.tensor(sorted(present), dtype=torch.int64)
         ids.append(every[torch.argsort(projected[0].depths[every], stable=True)])
         offsets.append(offsets[-1] + len(every))
     return Bins(torch.tensor(offsets), torch.cat(ids).to(torch.int32))
@@ -192,7 +192,7 @@ def _reached(projected: list[Projected], width: int, height: int) -> Bins:
 
 def _undecided(at: Projected, others: list[Projected], bins: Bins, width: int, height: int) -> Tensor:
     """Pixels [H,W] where a threshold (1/255, 0.999, or the transmittance's 1e-4) lies within reach of rounding."""
-    found = torch.zeros(height, width, dtype=torch.bool)
+    undecided = torch.zeros(height, width, dtype=torch.bool)
     columns = -(-width // TILE)
     for tile in range(len(bins.offsets) - 1):
         ids = bins.ids[bins.offsets[tile] : bins.offsets[tile + 1]].long()
@@ -216,8 +216,8 @@ def _undecided(at: Projected, others: list[Projected], bins: Bins, width: int, h
         near = (exact - LOG_CUT).abs() <= slack
         near |= (exact - LOG_FULL).abs() <= slack
         near |= (lasting[0] - LOG_END).abs() <= unsure
-        found[ys[0] : ys[-1] + 1, xs[0] : xs[-1] + 1] = (near & reached).any(1).reshape(len(ys), len(xs))
-    return found
+        undecided[ys[0] : ys[-1] + 1, xs[0] : xs[-1] + 1] = (near & reached).any(1).reshape(len(ys), len(xs))
+    return undecided
 
 
 LOG_CUT, LOG_FULL, LOG_END = (

@@ -68,9 +68,9 @@ def engines() -> dict[str, Engine]:
 
         return run
 
-    found: dict[str, Engine] = {f"{FUSED}, {name}": on(name, fused) for name in isa.supported()}
-    found[CHAIN] = on(isa.supported()[0], chain)
-    found[CONIC] = lambda problem: chain(problem, "reference")
+    by_name: dict[str, Engine] = {f"{FUSED}, {name}": on(name, fused) for name in isa.supported()}
+    by_name[CHAIN] = on(isa.supported()[0], chain)
+    by_name[CONIC] = lambda problem: chain(problem, "reference")
     if importlib.util.find_spec("triton") is not None:
-        found[GPU] = fused_gpu
-    return found
+        by_name[GPU] = fused_gpu
+    return by_name

@@ -96,7 +96,7 @@ def image(splats: list[Any], width: int, height: int) -> Any:
     """Colours [H][W][3]."""
     ordered = sorted(splats, key=lambda s: s[7])
     cut, full, end = mpf(1) / 255, mpf(0.999), mpf(1e-4)
-    found = []
+    pixels = []
     for py in range(height):
         for px in range(width):
             T, pixel = mpf(1), [mpf(0)] * 3
@@ -110,8 +110,8 @@ def image(splats: list[Any], width: int, height: int) -> Any:
                     break
                 pixel = [p + T * alpha * k for p, k in zip(pixel, color, strict=True)]
                 T *= 1 - alpha
-            found.append(pixel)
-    return [found[k * width : (k + 1) * width] for k in range(height)]
+            pixels.append(pixel)
+    return [pixels[k * width : (k + 1) * width] for k in range(height)]
 
 
 def compare(ratio: float, watched: int = 2) -> dict[str, float]:

@@ -93,28 +93,28 @@ def rounded_remainders(
     terms: list[Tensor] = []
 
     def watched(p: Projected, ids: Tensor, left: int, top: int, w: int, h: int, soft_cut: bool) -> Tensor:
-        found: Tensor = plain(p, ids, left, top, w, h, soft_cut)
+        shares: Tensor = plain(p, ids, left, top, w, h, soft_cut)
         if not len(ids):
-            return found
+            return shares
         d = weights[top : top + h, left : left + w].reshape(-1, 4)
-        before = 1 - torch.cat([torch.zeros_like(found[:, :1]), found.cumsum(1)[:, :-1]], 1)
+        before = 1 - torch.cat([torch.zeros_like(shares[:, :1]), shares.cumsum(1)[:, :-1]], 1)
         with torch.no_grad():
             payload = torch.cat([p.colors[ids], p.depths[ids, None]], 1)
-            last = 1 - found.sum(1, keepdim=True)
+            last = 1 - shares.sum(1, keepdim=True)
             rest = torch.zeros_like(last)
             if beyond is not None:
                 rest = beyond[top : top + h, left : left + w].reshape(-1, 1) * last
-            gain = found * (d @ payload.T)
+            gain = shares * (d @ payload.T)
             behind = gain.sum(1, keepdim=True) - gain.cumsum(1) + rest
-            start = ((found @ payload) * d).abs().sum(1, keepdim=True) + rest.abs()
+            start = ((shares @ payload) * d).abs().sum(1, keepdim=True) + rest.abs()
             noise = torch.randn(*gain.shape, generator=g, dtype=torch.float64)
             first = torch.randn(*start.shape, generator=g, dtype=torch.float64)
             off = U * (first * start + (noise * behind.abs() * (gain != 0)).cumsum(1))
-            alpha = found / before
-            slope = torch.where(found > 0, off * alpha / (1 - alpha), 0.0)
-        log_alpha = torch.log(torch.where(found > 0, found / before, 1.0))
+            alpha = shares / before
+            slope = torch.where(shares > 0, off * alpha / (1 - alpha), 0.0)
+        log_alpha = torch.log(torch.where(shares > 0, shares / before, 1.0))
         terms.append((slope * log_alpha).sum())
-        return found
+        return shares
 
     definition._weights = watched
     try:

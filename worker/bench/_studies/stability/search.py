@@ -76,11 +76,11 @@ def ratios(problem: Problem, engine: Engine) -> dict[str, Ratio]:
         x = values.gradients[name].double()
         return x[None] if name == "pose" else x.reshape(len(x), -1)
 
-    found = {}
+    by_quantity = {}
     for name in QUANTITIES:
         error = rows(got, name) - rows(problem.exact, name)
-        found[name] = Ratio(*(worst(error, rows(unit, name)) for unit in units))
-    return found
+        by_quantity[name] = Ratio(*(worst(error, rows(unit, name)) for unit in units))
+    return by_quantity
 
 
 def worst(error: Tensor, unit: Tensor) -> float:
@@ -131,22 +131,22 @@ class Search:
         if (family.name, numbers) in self.known:
             return self.known[family.name, numbers]
         self.evaluations += 1
-        found = self.known[family.name, numbers] = self._measured(family, numbers)
-        return found
+        values = self.known[family.name, numbers] = self._measured(family, numbers)
+        return values
 
     def _measured(self, family: Family, numbers: tuple[float, ...]) -> dict[str, float]:
         scene = family.make(numbers)
         if not decided(scene):
             return dict.fromkeys(TARGETS, NOTHING)
-        found = {k: x.explained for k, x in ratios(posed(scene, FEW), self.engine).items()}
-        if any(x > self.best(k) for k, x in found.items()):
+        values = {k: x.explained for k, x in ratios(posed(scene, FEW), self.engine).items()}
+        if any(x > self.best(k) for k, x in values.items()):
             again = ratios(posed(scene, MANY), self.engine)
             # A larger value with few changes was luck.
-            found = {k: min(x, again[k].explained) for k, x in found.items()}
-        for k, x in found.items():
+            values = {k: min(x, again[k].explained) for k, x in values.items()}
+        for k, x in values.items():
             if x > self.best(k):
                 self.worst[k] = Point(family, numbers, x)
-        largest = {k: max(found[name] for name in names) for k, names in TARGETS.items()}
+        largest = {k: max(values[name] for name in names) for k, names in TARGETS.items()}
         for k, x in largest.items():
             kept = self.tried[k]
             kept.append(Point(family, numbers, x))

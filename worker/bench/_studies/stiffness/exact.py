@@ -19,14 +19,14 @@ def value(objective: Objective, x: Tensor) -> Tensor:
     terms = []
     for shot in objective.shots:
         height, width = shot.photo.shape[:2]
-        seen = ops.project(
+        splats = ops.project(
             groups["means"], groups["log_scales"], groups["quats"], groups["logit_opacities"], groups["sh"],
             shot.viewmat.double(), shot.K.double(), width, height,
             degree=objective.degree, antialias=objective.antialias, backend="reference",
         )  # fmt: skip
-        bins = ops.bin(seen, width, height, backend="reference")
+        bins = ops.bin(splats, width, height, backend="reference")
         color, _, _ = ops.composite(
-            seen, bins, width, height, background=shot.background.double(), backend="reference"
+            splats, bins, width, height, background=shot.background.double(), backend="reference"
         )
         residual = color - shot.photo.double() / 255.0
         if shot.mask is not None:
@@ -40,8 +40,8 @@ def value(objective: Objective, x: Tensor) -> Tensor:
 def gradient(objective: Objective, x: Tensor) -> Tensor:
     """The gradient [N, 59] in float64."""
     leaf = x.detach().clone().requires_grad_()
-    (found,) = torch.autograd.grad(value(objective, leaf), leaf)
-    return found
+    (slope,) = torch.autograd.grad(value(objective, leaf), leaf)
+    return slope
 
 
 def product(objective: Objective, x: Tensor, metric: Metric) -> Callable[[Tensor], Tensor]:
@@ -50,7 +50,7 @@ def product(objective: Objective, x: Tensor, metric: Metric) -> Callable[[Tensor
     (slope,) = torch.autograd.grad(value(objective, leaf), leaf, create_graph=True)
 
     def apply(u: Tensor) -> Tensor:
-        (found,) = torch.autograd.grad((slope * (metric.root * u)).sum(), leaf, retain_graph=True)
-        return metric.root * found
+        (second,) = torch.autograd.grad((slope * (metric.root * u)).sum(), leaf, retain_graph=True)
+        return metric.root * second
 
     return apply

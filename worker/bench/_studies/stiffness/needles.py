@@ -49,12 +49,12 @@ def images(values: Tensor) -> Tensor:
     for eye in EYES:
         camera = look_at(DISTANCE * np.array(eye) / np.linalg.norm(eye), np.zeros(3), SIDE, SIDE, FOCAL)
         viewmat, K = torch.as_tensor(camera.viewmat), torch.as_tensor(camera.K)
-        seen = ops.project(
+        splats = ops.project(
             values[None, :3], values[None, 3:6], values[None, 6:10], values[10:], color, viewmat.double(), K.double(),
             SIDE, SIDE, degree=0, backend="reference",
         )  # fmt: skip
-        bins = ops.bin(seen, SIDE, SIDE, backend="reference")
-        pixels.append(ops.composite(seen, bins, SIDE, SIDE, backend="reference")[0].reshape(-1))
+        bins = ops.bin(splats, SIDE, SIDE, backend="reference")
+        pixels.append(ops.composite(splats, bins, SIDE, SIDE, backend="reference")[0].reshape(-1))
     return torch.cat(pixels)
 
 

@@ -31,19 +31,19 @@ def measure(state: State) -> list[Row]:
     rows: list[Row] = []
     two = Objective(state.mean.shots[:EXACT], degree=state.mean.degree, antialias=state.mean.antialias)
     true = exact.product(two, x, metric)
-    found = largest(true, start(metric), tolerance=0.03, most=30)
+    sharpest = largest(true, start(metric), tolerance=0.03, most=30)
     gradient = exact.gradient(two, x)
     # Random vectors after one product: mixtures of the directions that are curved.
     mixed = [true(start(metric, seed)) for seed in (1, 2)]
     rows.append(
         {
             "sweep": "float64",
-            "largest": found.value / LIMIT,
+            "largest": sharpest.value / LIMIT,
             "asymmetry": asymmetry(true, *mixed),
             "gradient": float((two.gradient(x) - gradient).norm() / gradient.norm()),
         }
     )
-    reached = true(found.vector)
+    reached = true(sharpest.vector)
     for share in SHARES:
         fast = product(two.gradient, x, metric, share)
         top = largest(fast, start(metric), tolerance=0.03, most=30)
@@ -51,7 +51,7 @@ def measure(state: State) -> list[Row]:
             {
                 "sweep": "share",
                 "value": share,
-                "off": float((fast(found.vector) - reached).norm() / reached.norm()),
+                "off": float((fast(sharpest.vector) - reached).norm() / reached.norm()),
                 "asymmetry": asymmetry(fast, *mixed),
                 "largest": top.value / LIMIT,
             }

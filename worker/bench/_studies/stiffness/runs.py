@@ -54,10 +54,10 @@ class Watched(CpuEngine):
     def train(self, *arguments: Any, rates: Rates, **named: Any) -> StepResult:
         factors = self.factors if len(self.losses) >= self.after else {}
         scaled = replace(rates, **{name: getattr(rates, name) * by for name, by in factors.items()})
-        seen = super().train(*arguments, rates=scaled, **named)
-        self.refused += seen.refused
-        self.losses.append(seen.loss)
-        return seen
+        result = super().train(*arguments, rates=scaled, **named)
+        self.refused += result.refused
+        self.losses.append(result.loss)
+        return result
 
 
 def training(
@@ -214,10 +214,10 @@ def measure(state: State, tolerance: float = 0.05) -> Row:
             [float((u * product(photo.gradient, state.x, metric)(u)).sum()) for photo in state.photos]
         )
 
-    found = top(state.mean, state.metric, tolerance, 40, 20)
+    of_mean = top(state.mean, state.metric, tolerance, 40, 20)
     searched = evenly(state.photos, SINGLE)
     singles = [top(photo, state.metric, tolerance, 25) for photo in searched]
-    candidates = [found.vector, *(single.vector for single in singles)]
+    candidates = [of_mean.vector, *(single.vector for single in singles)]
     curvatures = [over_photos(u, state.metric) for u in candidates]
     ratios = [mean_square.ratio(h) for h in curvatures]
     worst = max(range(len(ratios)), key=lambda k: ratios[k])
@@ -231,12 +231,12 @@ def measure(state: State, tolerance: float = 0.05) -> Row:
     h = curvatures[worst]
     return {
         "gaussians": len(state.x),
-        "ratio": found.value / LIMIT,
-        "error": found.error / LIMIT,
-        "products": found.products,
+        "ratio": of_mean.value / LIMIT,
+        "error": of_mean.error / LIMIT,
+        "products": of_mean.products,
         "values": int((state.metric.root > 0).sum()),
-        "beyond": found.share_above(LIMIT),
-        "groups": _by_group(found.vector),
+        "beyond": of_mean.share_above(LIMIT),
+        "groups": _by_group(of_mean.vector),
         "photos": [single.value / LIMIT for single in singles],
         "stochastic": ratios[worst],
         "seen_by": float(h.sum() ** 2 / (h * h).sum()),

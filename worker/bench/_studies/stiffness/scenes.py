@@ -69,8 +69,8 @@ def load(name: str, longest: int, work: Path, *, photos: int = 24) -> Small:
         taken = {}
     frame = Normalization.of(scene)
 
-    def views(wanted: Sequence[View]) -> list[TrainingView]:
-        shot = [taken[view.name] for view in wanted] if taken else load_views(wanted, longest)
+    def views(selection: Sequence[View]) -> list[TrainingView]:
+        shot = [taken[view.name] for view in selection] if taken else load_views(selection, longest)
         return [TrainingView.of(photo, frame) for photo in shot]
 
     training, held_out = split_views(scene, options)

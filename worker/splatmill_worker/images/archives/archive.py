@@ -202,7 +202,7 @@ def _check_declared(entries: list[zipfile.ZipInfo]) -> None:
     """Raise UnsafeArchive for names, kinds and sizes in the archive's directory that are not allowed."""
     if len(entries) > MAX_ENTRIES:
         raise UnsafeArchive(f"it holds {len(entries)} files; at most {MAX_ENTRIES} are allowed")
-    seen: set[str] = set()
+    names: set[str] = set()
     for entry in entries:
         name = entry.filename
         windows = PureWindowsPath(name)
@@ -215,9 +215,9 @@ def _check_declared(entries: list[zipfile.ZipInfo]) -> None:
             raise UnsafeArchive(f"{name!r} is a link or a device, not a file")
         if entry.flag_bits & 1:
             raise UnsafeArchive(f"{name!r} is encrypted")
-        if name in seen:
+        if name in names:
             raise UnsafeArchive(f"two files are called {name!r}")
-        seen.add(name)
+        names.add(name)
         if entry.file_size > MAX_FILE_BYTES:
             raise UnsafeArchive(
                 f"{name!r} has {entry.file_size} bytes when unpacked; at most {MAX_FILE_BYTES} are allowed"

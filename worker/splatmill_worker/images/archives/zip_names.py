@@ -153,6 +153,6 @@ def _known(archive: zipfile.ZipFile) -> set[str]:
             text = file.read(CAMERA_BYTES).decode("utf-8", "replace")
         if base.endswith(".json"):
             text = re.sub(r"\\u([0-9a-fA-F]{4})", lambda match: chr(int(match[1], 16)), text)
-        found = _WORD.findall(unicodedata.normalize("NFC", text))
-        words.update(found, (splitext(word)[0] for word in found))
+        matches = _WORD.findall(unicodedata.normalize("NFC", text))
+        words.update(matches, (splitext(word)[0] for word in matches))
     return words

@@ -65,8 +65,8 @@ def main() -> None:
 
 def program_files() -> list[Path]:
     """Return what the interpreter and its modules are read from."""
-    found = [importlib.util.find_spec(name) for name in ("splatmill", "splatmill_worker")]
-    modules = [Path(place) for spec in found if spec for place in spec.submodule_search_locations or ()]
+    specs = [importlib.util.find_spec(name) for name in ("splatmill", "splatmill_worker")]
+    modules = [Path(place) for spec in specs if spec for place in spec.submodule_search_locations or ()]
     system = [Path(place) for place in _SYSTEM]
     imported = [Path(place) for place in sys.path if os.path.isdir(place)]
     linked = [entry.resolve() for place in imported for entry in place.iterdir() if entry.is_symlink()]

@@ -118,9 +118,9 @@ def described(error: Exception) -> dict[str, Any]:
         return {"name": "system", "given": [error.errno, str(error.strerror), str(error.filename)]}
     if isinstance(error, MemoryError):
         return {"name": "memory", "given": []}
-    for name, (kind, given) in _CLASSES.items():
+    for name, (kind, arguments_of) in _CLASSES.items():
         if type(error) is kind:
-            return {"name": name, "given": [str(value)[:MAX_REASON] for value in given(error)]}
+            return {"name": name, "given": [str(value)[:MAX_REASON] for value in arguments_of(error)]}
     return {"name": "other", "given": [f"{type(error).__name__}: {error}"[:MAX_REASON]]}
 
 
@@ -130,17 +130,17 @@ def error_of(description: Any, fault: Callable[[str], Exception]) -> Exception:
     Raises ValueError for anything but a description.
     """
     try:
-        name, given = description["name"], description["given"]
+        name, arguments = description["name"], description["given"]
         if name == "system":
-            number, text, path = given
+            number, text, path = arguments
             return OSError(int(number), str(text)[:MAX_REASON], str(path)[:MAX_REASON])
         if name == "memory":
             return MemoryError()
-        given = [str(value)[:MAX_REASON] for value in given]
-        if name == "picture" and given[0] not in _PICTURE_CODES:
+        arguments = [str(value)[:MAX_REASON] for value in arguments]
+        if name == "picture" and arguments[0] not in _PICTURE_CODES:
             raise ValueError("the code of a fault is not known")
         if name in _CLASSES:
-            return _CLASSES[name][0](*given)
-        return fault(f"it does not decode: {given[0]}")
+            return _CLASSES[name][0](*arguments)
+        return fault(f"it does not decode: {arguments[0]}")
     except (TypeError, KeyError, IndexError, OverflowError) as error:
         raise ValueError("the description of an error is not valid") from error

@@ -137,26 +137,26 @@ def hidden_in(photos: Sequence[Candidate], decode: Callable[[int, tuple[int, int
     for members in groups.values():
         names, which = tuple(photos[index].name for index in members), _which(photos, members)
         clear: list[Region] = []
-        found = still(len(members), _pictures(photos, circles, members, decode, clear))
+        area = still(len(members), _pictures(photos, circles, members, decode, clear))
         # What is transparent in all of them, or lies round their circles, is known to be empty.
-        if found is not None:
-            found = found.without(np.logical_and.reduce(clear))
-        if found is None:
+        if area is not None:
+            area = area.without(np.logical_and.reduce(clear))
+        if area is None:
             continue
-        if not found.masked:
+        if not area.masked:
             warnings.append(
-                f"{found.share:.0%} of the picture never changes {which}, such as {names[0]}. Either the camera stood "
+                f"{area.share:.0%} of the picture never changes {which}, such as {names[0]}. Either the camera stood "
                 "still, as before a turntable, or it hardly moved. If something turned before it, mask all else."
             )
             continue
-        what = f"{found.share:.0%} of the picture, {found.place}, never changes {which}"
-        shown.append(Overlay(names, what, found.region))
+        what = f"{area.share:.0%} of the picture, {area.place}, never changes {which}"
+        shown.append(Overlay(names, what, area.region))
         warnings.append(
             f"{what}, such as {names[0]}. It is taken for a logo, a text, a bar or a part of the camera's holder, and "
             "is masked in all of them; the report shows it. If it belongs to the scene, give photos from more sides."
         )
         for index in members:
-            regions[index] = _together(regions[index], found.region)
+            regions[index] = _together(regions[index], area.region)
     return Hidden(tuple(regions), tuple(circles), tuple(shown), tuple(warnings))
 
 

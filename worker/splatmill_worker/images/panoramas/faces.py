@@ -115,9 +115,9 @@ def _seen_parts(lens: Lens) -> dict[str, tuple[float, float, float, float]]:
     parts = {}
     for name, rotation in FACES.items():
         at = distort(lens, rays.reshape(-1, 3) @ rotation).reshape(LOOKED_UP, LOOKED_UP, 2)
-        seen = np.all((at >= 0.0) & (at <= (lens.width, lens.height)), axis=2)
-        if seen.mean() >= MIN_SHARE:
-            rows, columns = np.nonzero(seen)
+        visible = np.all((at >= 0.0) & (at <= (lens.width, lens.height)), axis=2)
+        if visible.mean() >= MIN_SHARE:
+            rows, columns = np.nonzero(visible)
             parts[name] = (
                 float(columns.min()) / LOOKED_UP,
                 float(rows.min()) / LOOKED_UP,
@@ -158,12 +158,12 @@ def cut(scene: Scene) -> Scene:
     )
     if scene.point_views is None:
         return scene
-    offsets, seen = scene.point_views
+    offsets, observers = scene.point_views
     points = scene.points[np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))]
-    chosen = starts[seen]
+    chosen = starts[observers]
     for index, part in enumerate(parts):
         if len(part) > 1:
-            rows = np.flatnonzero(seen == index)
+            rows = np.flatnonzero(observers == index)
             axes = np.array([view.camera.axis for view in part])
             chosen[rows] += ((points[rows] - part[0].camera.center) @ axes.T).argmax(axis=1)
     return replace(scene, point_views=PointViews(offsets, chosen.astype(np.int32)))
@@ -200,10 +200,10 @@ def joined(scene: Scene) -> Scene:
         return replace(scene, views=scene_views)
     number = {name: index for index, name in enumerate(views)}
     of_view = np.array([number[view.photo] for view in scene.views], np.int64)
-    offsets, seen = scene.point_views
+    offsets, observers = scene.point_views
     of_point = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
     # Stereo may have found a point in two faces of a photo.
-    pairs = np.unique(of_point * len(views) + of_view[seen])
+    pairs = np.unique(of_point * len(views) + of_view[observers])
     counts = np.bincount(pairs // len(views), minlength=len(offsets) - 1)
     point_views = PointViews(
         np.concatenate([[0], np.cumsum(counts)]).astype(np.int64), (pairs % len(views)).astype(np.int32)
@@ -245,10 +245,10 @@ def resampled(pixels: Pixels, face: Face, camera: Camera) -> tuple[torch.Tensor,
     samples = max(1, min(MAX_SAMPLES, math.ceil(per_radian / camera.fx - 1e-6)))
     if face.lens.model == PANORAMA:
         return _resampled_panorama(pixels, face, camera, samples), None
-    planes, seen = look_ups.resampled(
+    planes, visible = look_ups.resampled(
         torch.from_numpy(pixels).permute(2, 0, 1).float(), face.lens, camera, samples, face.rotation
     )
-    return planes, seen
+    return planes, visible
 
 
 def _resampled_panorama(pixels: Pixels, face: Face, camera: Camera, samples: int) -> torch.Tensor:

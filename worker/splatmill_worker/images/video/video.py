@@ -132,15 +132,15 @@ def _candidates(path: Path, count: int, cancelled: Callable[[], bool]) -> list[C
 
     The motion to a frame of another size, as when a phone is turned while it records, is not known and counts as none.
     """
-    found: list[Candidate] = []
+    candidates: list[Candidate] = []
     last: Grey | None = None
     for number, score, small in _sharpest(path, count, cancelled):
         moved = displacement(last, small) if last is not None and last.shape == small.shape else 0.0
-        found.append(Candidate(number, score, moved))
+        candidates.append(Candidate(number, score, moved))
         last = small
-    if not found:
+    if not candidates:
         raise UnusableVideo(path.name, "it contains no frame")
-    return found
+    return candidates
 
 
 def _sharpest(path: Path, count: int, cancelled: Callable[[], bool]) -> Iterator[tuple[int, float, Grey]]:
@@ -171,19 +171,19 @@ def _decoded(
 
     Raises UnusableVideo where no frame decodes or a limit is exceeded, and Cancelled.
     """
-    seen = 0
+    count = 0
 
     def frames() -> Iterator[tuple[int, av.VideoFrame]]:
-        nonlocal seen
+        nonlocal count
         for number, frame in enumerate(guarded.frames(path.name, container, stream)):
             if cancelled():
                 raise Cancelled("Reading the video was cancelled.")
-            seen = number + 1
+            count = number + 1
             yield number, frame
 
     try:
         with guarded.opened_video(path) as (container, stream):
             yield stream.sample_aspect_ratio or stream.codec_context.sample_aspect_ratio, frames()
     except av.FFmpegError as error:
-        if not seen:
+        if not count:
             raise UnusableVideo(path.name, f"it does not decode as video ({plain(error)})") from error

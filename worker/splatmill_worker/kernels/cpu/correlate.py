@@ -21,6 +21,6 @@ def correlate(
 ) -> Tensor:
     """Return the correlation [N,D] of each patch with the image at each depth, as `reference.correlate` does."""
     scores = torch.empty(len(rays), len(inverse_depths))
-    given = (image, rays, patches, inverse_depths, turn, shift)
-    cpu.engine.correlate(*(x.detach().contiguous() for x in given), margin, least_variance, scores)
+    tensors = (image, rays, patches, inverse_depths, turn, shift)
+    cpu.engine.correlate(*(x.detach().contiguous() for x in tensors), margin, least_variance, scores)
     return scores

@@ -372,7 +372,7 @@ class Step:
         color = (0.0, 0.0, 0.0) if background is None else tuple(background.tolist())
         if self._clusters is not None:
             self._clusters.choose(*self._state, camera, self.threads)
-        seen = engine.render(
+        numbers = engine.render(
             self._frame,
             self.blocks,
             self._rows,
@@ -385,7 +385,7 @@ class Step:
             *(() if self.waves is None else (x.detach().contiguous() for x in self.waves)),
         )
         self._waved = None if self.waves is None else len(self.waves.values)
-        self.visibility = Visibility(*seen)
+        self.visibility = Visibility(*numbers)
         self._degree, self._size, self._rendered = degree, (height, width), True
 
     def _take_gradient(self, d_color: Tensor, d_alpha: Tensor | None, d_depth: Tensor | None) -> Tensor:

@@ -44,8 +44,8 @@ def correction(room: int, where: torch.device, beta2: float) -> Tensor:
 
 @triton.jit
 def drift_kernel(
-    last_step: Ints, seen: Bytes, table: Floats, travel: Floats, decay1: Floats, decay2: Floats, count: Int, step: Int,
-    ratio: Float, log2_beta2: Float, BLOCK: tl.constexpr,
+    last_step: Ints, visible: Bytes, table: Floats, travel: Floats, decay1: Floats, decay2: Floats, count: Int,
+    step: Int, ratio: Float, log2_beta2: Float, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Write what the steps that each Gaussian missed before `step` amount to, and mark every seen one as current.
 
@@ -54,7 +54,7 @@ def drift_kernel(
     """
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = i < count
-    shown = here & (tl.load(seen + i, mask=here, other=0) != 0)
+    shown = here & (tl.load(visible + i, mask=here, other=0) != 0)
     last = tl.load(last_step + i, mask=here, other=0)
     missed = tl.where(shown, tl.maximum(step - 1 - last, 0), 0)
     most = tl.minimum(tl.max(missed, 0), LONGEST)
@@ -85,7 +85,7 @@ def advance(p, g, m, v, rate, size, root, keep, add):
 
 @triton.jit
 def planes_kernel(
-    values: Floats, grads: Floats, exp_avg: Floats, exp_avg_sq: Floats, seen: Bytes, travel: Floats, decay1: Floats,
+    values: Floats, grads: Floats, exp_avg: Floats, exp_avg_sq: Floats, visible: Bytes, travel: Floats, decay1: Floats,
     decay2: Floats, refused: Ints, count: Int, stride: Int, channels: Int, means_rate: Float, scales_rate: Float,
     quats_rate: Float, opacity_rate: Float, dc_rate: Float, rest_rate: Float, size: Float, root: Float, keep: Float,
     add: Float, BLOCK: tl.constexpr,
@@ -93,7 +93,7 @@ def planes_kernel(
     """One step on the first `channels` of a scene's planes [59, stride], for the Gaussians seen."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = i < count
-    shown = here & (tl.load(seen + i, mask=here, other=0) != 0)
+    shown = here & (tl.load(visible + i, mask=here, other=0) != 0)
     gone = tl.load(travel + i, mask=shown, other=0.0)
     keep1 = tl.load(decay1 + i, mask=shown, other=1.0)
     keep2 = tl.load(decay2 + i, mask=shown, other=1.0)
@@ -121,18 +121,20 @@ def planes_kernel(
 class CatchUp:
     """What the visible Gaussians of one step missed, as `drift_kernel` computes it, for use by every group.
 
-    Marks the rows of seen (uint8 [N]) as current in last_step (int32 [N]).
+    Marks the rows of visible (uint8 [N]) as current in last_step (int32 [N]).
     """
 
-    def __init__(self, seen: Tensor, last_step: Tensor, step: int, beta2: float) -> None:
-        count = seen.shape[0]
-        like: dict[str, Any] = {"device": seen.device, "dtype": torch.float32}
-        self.seen = seen
+    def __init__(self, visible: Tensor, last_step: Tensor, step: int, beta2: float) -> None:
+        count = visible.shape[0]
+        like: dict[str, Any] = {"device": visible.device, "dtype": torch.float32}
+        self.visible = visible
         self.travel, self.decay1, self.decay2 = (torch.empty(count, **like) for _ in range(3))
-        table = correction(max(1024, 1 << step.bit_length()), seen.device, beta2)  # a new table per doubling
+        table = correction(
+            max(1024, 1 << step.bit_length()), visible.device, beta2
+        )  # a new table per doubling
         if count:
             drift_kernel[(triton.cdiv(count, BLOCK),)](
-                last_step, seen, table, self.travel, self.decay1, self.decay2, count, step,
+                last_step, visible, table, self.travel, self.decay1, self.decay2, count, step,
                 BETA1 / math.sqrt(beta2), math.log2(beta2), BLOCK=BLOCK,
             )  # fmt: skip
 
@@ -150,6 +152,6 @@ def apply_planes(
     count = params.shape[1]
     if count:
         planes_kernel[(triton.cdiv(count, BLOCK),)](
-            params, grads, exp_avg, exp_avg_sq, missed.seen, missed.travel, missed.decay1, missed.decay2, refused,
+            params, grads, exp_avg, exp_avg_sq, missed.visible, missed.travel, missed.decay1, missed.decay2, refused,
             count, count, channels, *rates, *_scale(step, beta2), BLOCK=BLOCK,
         )  # fmt: skip

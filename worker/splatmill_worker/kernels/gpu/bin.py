@@ -123,8 +123,8 @@ def pairs_kernel(
     top, down = tile_range(my, ey, rows)
     area = tl.where(here, across * down, 0)
     across = tl.maximum(across, 1)
-    found = tl.zeros([BLOCK], tl.int64)
-    place = found
+    pairs = tl.zeros([BLOCK], tl.int64)
+    place = pairs
     if WRITE:
         place = tl.load(ends + slot, mask=here, other=0) - tl.load(counts + slot, mask=here, other=0)
     most = tl.max(area, 0)
@@ -140,14 +140,14 @@ def pairs_kernel(
         hit = (candidate < area[:, None]) & (value <= cut[:, None])
         one = hit.to(tl.int32)
         if WRITE:
-            at = place[:, None] + found[:, None] + (tl.cumsum(one, axis=1) - one)
+            at = place[:, None] + pairs[:, None] + (tl.cumsum(one, axis=1) - one)
             fits = hit & (at < room)
             tl.store(keys + at, (row * columns + column).to(keys.dtype.element_ty), mask=fits)
             tl.store(ids + at, splat[:, None] + tl.zeros_like(one), mask=fits)
-        found += tl.sum(one, axis=1).to(tl.int64)
+        pairs += tl.sum(one, axis=1).to(tl.int64)
         done += LANES
     if not WRITE:
-        tl.store(counts + slot, found, mask=here)
+        tl.store(counts + slot, pairs, mask=here)
 
 
 @dataclass(frozen=True)

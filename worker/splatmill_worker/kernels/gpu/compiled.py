@@ -164,11 +164,11 @@ def _bind(
     `params`.
     """
     floats, zeros = torch.empty(4), {"i32": 0, "fp32": 0.0}
-    given = {name: constants.get(name, zeros.get(type_, floats)) for name, type_ in signature.items()}
+    arguments = {name: constants.get(name, zeros.get(type_, floats)) for name, type_ in signature.items()}
     bind = create_function_from_signature(function.signature, function.params, make_backend(target))
-    bound = bind(**given)[0]
-    if any(bound[name] is not value for name, value in given.items()):
-        raise TypeError(f"{function.__name__}: Triton binds {bound} where {given} were given.")
+    bound = bind(**arguments)[0]
+    if any(bound[name] is not value for name, value in arguments.items()):
+        raise TypeError(f"{function.__name__}: Triton binds {bound} where {arguments} were given.")
 
 
 def resources(binary: bytes) -> tuple[int, int]:
@@ -180,10 +180,10 @@ def resources(binary: bytes) -> tuple[int, int]:
         told = subprocess.run(
             [tool, "-res-usage", file.name], capture_output=True, text=True, check=True
         ).stdout
-    found = re.search(r"REG:(\d+) STACK:(\d+)", told)
-    if found is None:
+    match = re.search(r"REG:(\d+) STACK:(\d+)", told)
+    if match is None:
         raise RuntimeError(f"The output of cuobjdump -res-usage names no registers: {told!r}")
-    return int(found[1]), int(found[2])
+    return int(match[1]), int(match[2])
 
 
 def settings(variant: Variant) -> tuple[triton.Config, ...]:

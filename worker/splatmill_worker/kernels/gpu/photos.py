@@ -50,7 +50,7 @@ def over(photo: Tensor, alpha: Tensor, background: Tensor | None) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Seen:
+class Picture:
     """One photo as a step compares an image with it, on the device.
 
     pixels: uint8 [H, W, 3].
@@ -102,9 +102,9 @@ class Photos:
         assert isinstance(held, Tensor)
         return held
 
-    def seen(
+    def picture(
         self, photo: Tensor, alpha: Tensor | None, mask: Tensor | None, background: Tensor | None
-    ) -> Seen:
+    ) -> Picture:
         """Return the photo uint8 [H, W, 3] over a background [3] on the device where it has alpha uint8 [H, W].
 
         Statistics of transparent photos are not kept, since they change with the background.
@@ -112,8 +112,8 @@ class Photos:
         pixels = self.here(photo)
         used, count = self._used(mask, photo.shape[0] * photo.shape[1])
         if alpha is not None:
-            return Seen(over(pixels, self.here(alpha), background), used, count, None)
-        return Seen(pixels, used, count, self._stats(photo, pixels, mask, used))
+            return Picture(over(pixels, self.here(alpha), background), used, count, None)
+        return Picture(pixels, used, count, self._stats(photo, pixels, mask, used))
 
     def forget_stats(self) -> None:
         """Free the statistics of all photos, for good: there is too little memory."""

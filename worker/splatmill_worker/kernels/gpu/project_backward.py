@@ -78,13 +78,13 @@ def color_backward_kernel(
     """
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = i < count
-    seen = here & (tl.load(records + i.to(tl.int64) * STRIDE + EXTENT_X, mask=here, other=0.0) > 0.0)
+    visible = here & (tl.load(records + i.to(tl.int64) * STRIDE + EXTENT_X, mask=here, other=0.0) > 0.0)
     w00, w01, w02, w10, w11, w12, w20, w21, w22, t0, t1, t2, _, _, _, _ = load_camera(viewmat, K)
-    m0, m1, m2 = load3(means, i, seen, stride, PLANAR)
+    m0, m1, m2 = load3(means, i, visible, stride, PLANAR)
     grow = gradient + i.to(tl.int64) * GRADIENT_STRIDE
-    g_red = tl.load(grow + RED, mask=seen, other=0.0)
-    g_green = tl.load(grow + GREEN, mask=seen, other=0.0)
-    g_blue = tl.load(grow + BLUE, mask=seen, other=0.0)
+    g_red = tl.load(grow + RED, mask=visible, other=0.0)
+    g_green = tl.load(grow + GREEN, mask=visible, other=0.0)
+    g_blue = tl.load(grow + BLUE, mask=visible, other=0.0)
     d0 = m0 + w00 * t0 + w10 * t1 + w20 * t2
     d1 = m1 + w01 * t0 + w11 * t1 + w21 * t2
     d2 = m2 + w02 * t0 + w12 * t1 + w22 * t2
@@ -92,7 +92,7 @@ def color_backward_kernel(
     # A row that is not seen may sit on the camera centre; it gets direction 0 and no gradient.
     length = tl.where(length > 0.0, length, 1.0)
     d0, d1, d2 = d0 / length, d1 / length, d2 / length
-    red, green, blue = shade(sh, i, seen, stride, d0, d1, d2, COEFFICIENTS, USED, PLANAR)
+    red, green, blue = shade(sh, i, visible, stride, d0, d1, d2, COEFFICIENTS, USED, PLANAR)
     g_red = tl.where(red >= 0.0, g_red, 0.0)
     g_green = tl.where(green >= 0.0, g_green, 0.0)
     g_blue = tl.where(blue >= 0.0, g_blue, 0.0)
@@ -104,9 +104,9 @@ def color_backward_kernel(
         tl.store(at(d_sh, i, 3 * k + 1, stride, 3 * COEFFICIENTS, PLANAR), value * g_green, mask=here)
         tl.store(at(d_sh, i, 3 * k + 2, stride, 3 * COEFFICIENTS, PLANAR), value * g_blue, mask=here)
     for k in tl.static_range(1, USED):
-        r = tl.load(at(sh, i, 3 * k, stride, 3 * COEFFICIENTS, PLANAR), mask=seen, other=0.0)
-        g = tl.load(at(sh, i, 3 * k + 1, stride, 3 * COEFFICIENTS, PLANAR), mask=seen, other=0.0)
-        b = tl.load(at(sh, i, 3 * k + 2, stride, 3 * COEFFICIENTS, PLANAR), mask=seen, other=0.0)
+        r = tl.load(at(sh, i, 3 * k, stride, 3 * COEFFICIENTS, PLANAR), mask=visible, other=0.0)
+        g = tl.load(at(sh, i, 3 * k + 1, stride, 3 * COEFFICIENTS, PLANAR), mask=visible, other=0.0)
+        b = tl.load(at(sh, i, 3 * k + 2, stride, 3 * COEFFICIENTS, PLANAR), mask=visible, other=0.0)
         pulled = r * g_red + g * g_green + b * g_blue
         sx, sy, sz = slope(d0, d1, d2, k)
         n0 += pulled * sx
@@ -131,24 +131,24 @@ def shape_backward_kernel(
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = i < count
     row = records + i.to(tl.int64) * STRIDE
-    seen = here & (tl.load(row + EXTENT_X, mask=here, other=0.0) > 0.0)
+    visible = here & (tl.load(row + EXTENT_X, mask=here, other=0.0) > 0.0)
     w00, w01, w02, w10, w11, w12, w20, w21, w22, t0, t1, t2, fx, fy, cx, cy = load_camera(viewmat, K)
     # Culled Gaussians are not read: what they hold (NaN, say) cannot come back as a gradient.
-    m0, m1, m2 = load3(means, i, seen, stride, PLANAR)
-    l0, l1, l2 = load3(log_scales, i, seen, stride, PLANAR)
-    qw, qx, qy, qz = load4(quats, i, seen, stride, PLANAR)
-    logit = tl.load(logit_opacities + i, mask=seen, other=0.0)
+    m0, m1, m2 = load3(means, i, visible, stride, PLANAR)
+    l0, l1, l2 = load3(log_scales, i, visible, stride, PLANAR)
+    qw, qx, qy, qz = load4(quats, i, visible, stride, PLANAR)
+    logit = tl.load(logit_opacities + i, mask=visible, other=0.0)
     grow = gradient + i.to(tl.int64) * GRADIENT_STRIDE
-    g_mx = tl.load(grow + MEAN_X, mask=seen, other=0.0)
-    g_my = tl.load(grow + MEAN_Y, mask=seen, other=0.0)
-    quu = 2.0 * LN2 * LN2 * tl.load(grow + SUM_QUU, mask=seen, other=0.0)
-    quv = 2.0 * LN2 * LN2 * tl.load(grow + SUM_QUV, mask=seen, other=0.0)
-    qvv = 2.0 * LN2 * LN2 * tl.load(grow + SUM_QVV, mask=seen, other=0.0)
-    q = tl.load(grow + SUM_Q, mask=seen, other=0.0)
-    g_z = tl.load(grow + DEPTH, mask=seen, other=0.0)
+    g_mx = tl.load(grow + MEAN_X, mask=visible, other=0.0)
+    g_my = tl.load(grow + MEAN_Y, mask=visible, other=0.0)
+    quu = 2.0 * LN2 * LN2 * tl.load(grow + SUM_QUU, mask=visible, other=0.0)
+    quv = 2.0 * LN2 * LN2 * tl.load(grow + SUM_QUV, mask=visible, other=0.0)
+    qvv = 2.0 * LN2 * LN2 * tl.load(grow + SUM_QVV, mask=visible, other=0.0)
+    q = tl.load(grow + SUM_Q, mask=visible, other=0.0)
+    g_z = tl.load(grow + DEPTH, mask=visible, other=0.0)
 
     # The forward pass again: cheaper than keeping it. A row that is not seen gets z = 1 and stays finite.
-    z = tl.where(seen, w20 * m0 + w21 * m1 + w22 * m2 + t2, 1.0)
+    z = tl.where(visible, w20 * m0 + w21 * m1 + w22 * m2 + t2, 1.0)
     u = (w00 * m0 + w01 * m1 + w02 * m2 + t0) / z
     v = (w10 * m0 + w11 * m1 + w12 * m2 + t1) / z
     low_u, high_u = -(0.15 * width + cx) / fx, (1.15 * width - cx) / fx
@@ -219,7 +219,7 @@ def shape_backward_kernel(
     dx, dy = du / z, dv / z
 
     # color_backward_kernel left the part through the direction m + W^T t in d_means.
-    n0, n1, n2 = load3(d_means, i, seen, stride, PLANAR)
+    n0, n1, n2 = load3(d_means, i, visible, stride, PLANAR)
     store3(
         d_means, i, here, stride,
         w00 * dx + w10 * dy + w20 * dz + n0, w01 * dx + w11 * dy + w21 * dz + n1, w02 * dx + w12 * dy + w22 * dz + n2,

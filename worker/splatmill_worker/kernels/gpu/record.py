@@ -103,9 +103,9 @@ def gradient_of_fields(gradient: Tensor, records: Tensor) -> tuple[Tensor, ...]:
     return gradient[:, :2], conics.float(), opacities.float(), gradient[:, COLOR], gradient[:, DEPTH_PLACE]
 
 
-def gradient_record(given: tuple[Tensor | None, ...], records: Tensor) -> Tensor:
+def gradient_record(gradients: tuple[Tensor | None, ...], records: Tensor) -> Tensor:
     """Return the gradient records [N, 16] for gradients to the first five fields of `Projected`; None counts as 0."""
-    means2d, conics, opacities, colors, depth = given
+    means2d, conics, opacities, colors, depth = gradients
     gradient = torch.zeros(records.shape[0], GRADIENT_WIDTH, device=records.device)
     if means2d is not None:
         gradient[:, :2] = means2d

@@ -61,17 +61,17 @@ def scores_kernel(
     source = records + i.to(tl.int64) * STRIDE
     extent_x = tl.load(source + EXTENT_X, mask=here, other=0.0)
     extent_y = tl.load(source + EXTENT_Y, mask=here, other=0.0)
-    seen = here & (extent_x > 0.0)
+    visible = here & (extent_x > 0.0)
     row = gradient + i.to(tl.int64) * GRADIENT_STRIDE
-    x = tl.load(row + MEAN_X, mask=seen, other=0.0) * half_width
-    y = tl.load(row + MEAN_Y, mask=seen, other=0.0) * half_height
+    x = tl.load(row + MEAN_X, mask=visible, other=0.0) * half_width
+    y = tl.load(row + MEAN_Y, mask=visible, other=0.0) * half_height
     place = scores + i
-    tl.store(place, tl.load(place, mask=seen) + tl.sqrt_rn(x * x + y * y), mask=seen)
+    tl.store(place, tl.load(place, mask=visible) + tl.sqrt_rn(x * x + y * y), mask=visible)
     place += count
-    tl.store(place, tl.load(place, mask=seen) + 1.0, mask=seen)
+    tl.store(place, tl.load(place, mask=visible) + 1.0, mask=visible)
     place += count
     largest = tl.maximum(extent_x, extent_y) * per_image
-    tl.store(place, tl.maximum(tl.load(place, mask=seen), largest), mask=seen)
+    tl.store(place, tl.maximum(tl.load(place, mask=visible), largest), mask=visible)
 
 
 @dataclass
@@ -211,9 +211,9 @@ class Step:
                 )
             moments = [
                 torch.zeros_like(params)
-                if given is None
-                else given.to(self.device, torch.float32).t().contiguous()
-                for given in (exp_avg, exp_avg_sq)
+                if moment is None
+                else moment.to(self.device, torch.float32).t().contiguous()
+                for moment in (exp_avg, exp_avg_sq)
             ]
             scores = torch.zeros(3, count, device=self.device)
             gradient = torch.empty_like(params)
@@ -274,11 +274,13 @@ class Step:
             )
         view, self._view = self._view, None
         with self._sparing():
-            given = [None if d is None else to_device(d, self.device) for d in (d_color, d_alpha, d_depth)]
-            assert given[0] is not None
-            seen = self._differentiate(view, given[0], given[1], given[2])
+            gradients = [
+                None if d is None else to_device(d, self.device) for d in (d_color, d_alpha, d_depth)
+            ]
+            assert gradients[0] is not None
+            visible = self._differentiate(view, gradients[0], gradients[1], gradients[2])
             refused = torch.zeros(1, dtype=torch.int32, device=self.device)
-            self._move(seen, view.degree, rates, step, refused)
+            self._move(visible, view.degree, rates, step, refused)
         self._listen(view.key, torch.zeros(3, device=self.device), view.lists.used, refused)
 
     def gradients(
@@ -332,15 +334,15 @@ class Step:
             view = self._shown(
                 viewmat, K, width, height, degree, behind, antialias, near, depth=False, whole=False
             )
-            seen_photo = self._photos.seen(photo, alpha, mask, behind)
+            seen_photo = self._photos.picture(photo, alpha, mask, behind)
             losses, d_color = loss_and_gradient(
                 view.image.color, seen_photo.pixels, dssim_weight=dssim_weight, mask=seen_photo.mask,
                 stats=seen_photo.stats, count=seen_photo.count,
             )  # fmt: skip
             assert d_color is not None
-            seen = self._differentiate(view, d_color, None, None)
+            visible = self._differentiate(view, d_color, None, None)
             refused = torch.zeros(1, dtype=torch.int32, device=self.device)
-            self._move(seen, degree, rates, step, refused)
+            self._move(visible, degree, rates, step, refused)
         self._listen(view.key, losses, view.lists.used, refused)
         return self._readback.latest
 
@@ -416,7 +418,7 @@ class Step:
                 2.0 / max(view.width, view.height), BLOCK=SCORES_BLOCK,
             )  # fmt: skip
 
-    def _move(self, seen: Tensor, degree: int, rates: Rates, step: int, refused: Tensor) -> None:
+    def _move(self, visible: Tensor, degree: int, rates: Rates, step: int, refused: Tensor) -> None:
         channels = PLANES["sh"].start + 3 * (degree + 1) ** 2
         if self._rates is None:
             # What `replace` was given has missed nothing, whatever the number of this step: a resumed run begins late.
@@ -425,7 +427,7 @@ class Step:
             rates.means, rates.log_scales, rates.quats, rates.logit_opacities, rates.sh_dc, rates.sh_rest,
         )  # fmt: skip
         self._steps, self._beta2 = step, rates.beta2
-        missed = adam.CatchUp(seen, self._last, step, rates.beta2)
+        missed = adam.CatchUp(visible, self._last, step, rates.beta2)
         adam.apply_planes(
             self._params,
             self._gradient,

@@ -29,10 +29,10 @@ def correlate(
     x, y = pixels[:, :, middle].unbind(-1)
     shown = (points[:, :, middle, 2] > LEAST_DEPTH) & (x > margin) & (x < width - margin)
     shown &= (y > margin) & (y < height - margin)
-    seen = _bilinear(image, pixels)
-    seen = seen - seen.mean(-1, keepdim=True)
-    variance = seen.square().mean(-1).clamp_min(least_variance)
-    scores = (seen * patches[:, None]).sum(-1) / (variance * rays.shape[1]).sqrt()
+    samples = _bilinear(image, pixels)
+    samples = samples - samples.mean(-1, keepdim=True)
+    variance = samples.square().mean(-1).clamp_min(least_variance)
+    scores = (samples * patches[:, None]).sum(-1) / (variance * rays.shape[1]).sqrt()
     return torch.where(shown, scores, -1.0)
 
 

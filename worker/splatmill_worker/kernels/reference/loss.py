@@ -39,20 +39,20 @@ def loss(
     the edge of a mask is treated like the edge of an image. Without a used pixel the loss is 0.
     """
     used = None if mask is None else (mask != 0).to(color.dtype)[..., None]
-    seen = photo.to(color.dtype) / 255
+    target = photo.to(color.dtype) / 255
     count = float(color[..., 0].numel())
     if used is not None:
         # where() in place of a product, so that a NaN at an unused pixel stays out.
-        color, seen = torch.where(used > 0, color, 0.0), seen * used
+        color, target = torch.where(used > 0, color, 0.0), target * used
         count = float(used.sum())
     if count == 0:
         return color.sum() * 0
-    l1 = (color - seen).abs().sum() / (3 * count)
+    l1 = (color - target).abs().sum() / (3 * count)
     if stats is None:
         stats = photo_stats(photo, mask=mask, dtype=color.dtype)
     mu1, mu2 = _window(color), stats.mean
     var1 = _window(color * color) - mu1 * mu1
-    covariance = _window(color * seen) - mu1 * mu2
+    covariance = _window(color * target) - mu1 * mu2
     ssim = ((2 * mu1 * mu2 + C1) * (2 * covariance + C2)) / (
         (mu1 * mu1 + mu2 * mu2 + C1) * (var1 + stats.variance + C2)
     )
@@ -64,11 +64,11 @@ def photo_stats(
     photo: Tensor, *, mask: Tensor | None = None, dtype: torch.dtype = torch.float32
 ) -> PhotoStats:
     """Return the windowed mean and variance of a photo (uint8 [H,W,3]) under a mask, each [H,W,3]."""
-    seen = photo.to(dtype) / 255
+    target = photo.to(dtype) / 255
     if mask is not None:
-        seen = seen * (mask != 0).to(dtype)[..., None]
-    mean = _window(seen)
-    return PhotoStats(mean, _window(seen * seen) - mean * mean)
+        target = target * (mask != 0).to(dtype)[..., None]
+    mean = _window(target)
+    return PhotoStats(mean, _window(target * target) - mean * mean)
 
 
 def _window(image: Tensor) -> Tensor:

@@ -62,7 +62,7 @@ def with_depth(
 
     Raises OSError and ValueError for photos as `load_view` does, and Cancelled.
     """
-    maps = pairs.found(_folders(capture, workdir, cancelled), scene.views)
+    maps = pairs.maps_of(_folders(capture, workdir, cancelled), scene.views)
     if not maps.names and not maps.of_view:
         return scene
     scene = replace(scene, left_out=tuple(each for each in scene.left_out if not _named(each[0], maps)))
@@ -77,12 +77,12 @@ def with_depth(
     paired = {index: each for index, each in maps.of_view.items() if scene.views[index].name in training}
     read = _read(scene.views, paired, on_progress, cancelled)
     warnings = _unread(read, len(paired))
-    found = _maps(read)
-    if not any(each.sure.any() for each in found):
-        if found:
+    readings = _maps(read)
+    if not any(each.sure.any() for each in readings):
+        if readings:
             warnings.append("The depth maps are not used: none of their pixels has the highest confidence.")
         return replace(scene, warnings=(*scene.warnings, *warnings))
-    measured = unit.of_maps(scene, found)
+    measured = unit.of_maps(scene, readings)
     if isinstance(measured, str):
         warnings.append(f"The depth maps are not used: {measured}.")
         return replace(scene, warnings=(*scene.warnings, *warnings))
@@ -92,8 +92,8 @@ def with_depth(
             f"{counted(len(others), 'depth map is', 'depth maps are')} not used, since at the points of the "
             f"photos, distances differ by more than {100 * unit.SPREAD:.0f} % by median: of {listed(others)}."
         )
-    found = [each for each in found if each.index not in measured.others]
-    positions, colors = points.of_maps(found, scene.views, measured.length, cancelled)
+    readings = [each for each in readings if each.index not in measured.others]
+    positions, colors = points.of_maps(readings, scene.views, measured.length, cancelled)
     # Held-out photos do not judge what is trained from.
     of_training = replace(
         scene,
@@ -104,7 +104,7 @@ def with_depth(
     )
     fit = scan_fit.as_it_lies(of_training, positions, colors, options.image_size, cancelled, from_photos=True)
     facts: dict[str, Any] = {
-        "depth_maps": len(found),
+        "depth_maps": len(readings),
         "depth_unit": measured.length,
         "depth_unit_points": measured.points,
         "depth_unit_spread": measured.spread,
@@ -117,7 +117,7 @@ def with_depth(
         warnings.append(f"The depth maps are not used. {measured.sentence}. {fit.sentence}")
         return replace(scene, warnings=(*scene.warnings, *warnings), facts=scene.facts | facts)
     note = (
-        f"{counted(len(found), 'depth map')} of photos to train on give {len(positions):,} points of the highest "
+        f"{counted(len(readings), 'depth map')} of photos to train on give {len(positions):,} points of the highest "
         f"confidence. {measured.sentence}. One for each cell of {fit.pixels:.1f} pixels of the closest photo leaves "
         f"{fit.resolved:,}, of which {len(fit.points):,} are used: photos show their colours."
     )
@@ -210,13 +210,13 @@ def _maps(read: _Read) -> list[DepthMap]:
     """The maps that were read, with the pixels that count: of the highest confidence, and on no edge."""
     occurring = np.unique(np.concatenate([np.zeros(0, np.uint8), *map(np.unique, read.sure.values())]))
     most, few = int(occurring.max(initial=0)), len(occurring) <= FEW_LEVELS
-    found = []
+    maps = []
     for index, levels in read.levels.items():
         sure = without_edges(levels)
         if index in read.sure:
             sure &= highest(read.sure[index], most, few)
-        found.append(DepthMap(index, levels, sure))
-    return found
+        maps.append(DepthMap(index, levels, sure))
+    return maps
 
 
 def _unread(read: _Read, count: int) -> list[str]:

@@ -52,15 +52,15 @@ def near_copies(
 
     copies: pairs of `same_photos`.
     """
-    found: dict[str, str] = {}
+    original_of: dict[str, str] = {}
     for view, other, _ in _pairs(scene, held_out, training, PARALLAX):
-        found.setdefault(other.name, view.name)
+        original_of.setdefault(other.name, view.name)
     held, trained = ({view.name for view in views} for views in (held_out, training))
     for copy, original in copies.items():
         for one, another in ((copy, original), (original, copy)):
             if one in trained and another in held:
-                found.setdefault(one, another)
-    return found
+                original_of.setdefault(one, another)
+    return original_of
 
 
 def same_photos(scene: Scene) -> dict[str, str]:
@@ -72,22 +72,22 @@ def same_photos(scene: Scene) -> dict[str, str]:
     ranked = sorted(scene.views, key=lambda view: (-view.camera.width * view.camera.height, view.name))
     rank = {view.name: index for index, view in enumerate(ranked)}
     small: dict[str, SmallPicture] = {}
-    found: dict[str, str] = {}
+    original_of: dict[str, str] = {}
     for view, other, shift in _pairs(scene, ranked, ranked, BESIDE):
-        if rank[other.name] < rank[view.name] or view.name in found or other.name in found:
+        if rank[other.name] < rank[view.name] or view.name in original_of or other.name in original_of:
             continue
         for each in (view, other):
             if each.name not in small:
                 small[each.name] = small_picture(each)
         if is_copy(small[other.name], small[view.name], one_place=shift <= ONE_PLACE):
-            found[other.name] = view.name
-    for original in dict.fromkeys(found.values()):
-        alike = [original, *(name for name, of in found.items() if of == original)]
+            original_of[other.name] = view.name
+    for original in dict.fromkeys(original_of.values()):
+        alike = [original, *(name for name, of in original_of.items() if of == original)]
         best = min(alike, key=lambda name: (-small[name].pixels, small[name].clipped, name))
         if best != original:
-            found |= dict.fromkeys(alike, best)
-            del found[best]
-    return dict(sorted(found.items()))
+            original_of |= dict.fromkeys(alike, best)
+            del original_of[best]
+    return dict(sorted(original_of.items()))
 
 
 def small_picture(view: View) -> SmallPicture:
@@ -130,7 +130,7 @@ def _pairs(
             if other is view or not (shift := _shift(view, other, points)) <= most:
                 continue
             both = ((other, points), (view, points_of[other.name]))
-            if any(len(seen) and _inside(each, seen).mean() >= OVERLAP for each, seen in both):
+            if any(len(cloud) and _inside(each, cloud).mean() >= OVERLAP for each, cloud in both):
                 yield view, other, shift
 
 

@@ -50,8 +50,8 @@ def honest_split(scene: Scene, options: TrainOptions) -> Split:
     while True:
         train, test = split_views(chosen, options.model_copy(update={"holdout": step}))
         near = near_copies(scene, test, train, same)
-        given = options.test_views is not None or any(view.split == "test" for view in test)
-        if len(near) <= MOST_NEAR * len(train) or given or len(test) < 2:
+        explicit = options.test_views is not None or any(view.split == "test" for view in test)
+        if len(near) <= MOST_NEAR * len(train) or explicit or len(test) < 2:
             break
         step *= 2
     if len(near) > MOST_NEAR * len(train):
@@ -101,19 +101,19 @@ def split_views(scene: Scene, options: TrainOptions) -> tuple[tuple[View, ...], 
     left to train on.
     """
     if options.test_views is not None:
-        wanted = set(options.test_views)
-        unknown = sorted(wanted - {view.name for view in scene.views})
+        names = set(options.test_views)
+        unknown = sorted(names - {view.name for view in scene.views})
         if unknown:
             raise Refusal(
                 "holdout_empty",
-                f"test_views has {len(unknown)} of {len(wanted)} names that belong to no photo with a camera: "
+                f"test_views has {len(unknown)} of {len(names)} names that belong to no photo with a camera: "
                 f"{listed(unknown)}.",
                 advice="Use the names of the photos in the capture, and only photos whose cameras were recovered.",
                 facts={"unknown": unknown},
             )
         ordered = sorted(scene.views, key=lambda view: view.name)
-        train = tuple(view for view in ordered if view.name not in wanted)
-        test = tuple(view for view in ordered if view.name in wanted)
+        train = tuple(view for view in ordered if view.name not in names)
+        test = tuple(view for view in ordered if view.name in names)
     else:
         try:
             train, test = split(scene, options.holdout)

@@ -51,7 +51,7 @@ def read(paths: list[Path]) -> Shots:
             f"it announces {cameras} cameras and {points} points, and has {len(text)} letters: it is cut off"
         )
     names = _names(bundle, [path for path in paths if path not in outs], cameras)
-    found = Shots([])
+    result = Shots([])
     for index in range(cameras):
         what = f"camera {index}"
         focal, k1, k2 = numbers(_next(lines, what), 3, what)
@@ -59,20 +59,20 @@ def read(paths: list[Path]) -> Shots:
         translation = np.array(numbers(_next(lines, what), 3, what))
         name = names[index]
         if not focal > 0.0:
-            found.left_out.append((name, "Bundler has not placed it"))
+            result.left_out.append((name, "Bundler has not placed it"))
             continue
         try:
             turn = FLIP @ rotation_of(rotation)
         except ValueError as error:
-            found.faulty.append((name, str(error)))
+            result.faulty.append((name, str(error)))
             continue
         pose = np.hstack([turn, (FLIP @ translation)[:, None]])
         model, distortion = pinhole_or(BROWN, (k1, k2, 0.0, 0.0))
-        found.shots.append(
+        result.shots.append(
             Shot(name, tuple(pose.ravel().tolist()), model, (focal, focal), (0.0, 0.0), distortion)
         )
-    found.points, found.colors = _points(lines, points)
-    return found
+    result.points, result.colors = _points(lines, points)
+    return result
 
 
 def _points(lines: Iterator[str], count: int) -> tuple[Float, npt.NDArray[np.uint8]]:

@@ -36,16 +36,16 @@ def read(paths: list[Path]) -> Shots:
         raise NoCameras("it is no list of cameras")
     if len(document) > MOST_SHOTS:
         raise ValueError(f"it has more than {MOST_SHOTS} cameras")
-    found = Shots([])
+    cameras = Shots([])
     for index, entry in enumerate(document):
         name = entry.get("img_name")
         if not isinstance(name, str):
             raise ValueError(f"camera {index} has no img_name, which names its photo")
         try:
-            found.shots.append(_shot(name, entry))
+            cameras.shots.append(_shot(name, entry))
         except ValueError as error:
-            found.faulty.append((name, str(error)))
-    return found
+            cameras.faulty.append((name, str(error)))
+    return cameras
 
 
 def _shot(name: str, entry: dict[str, Any]) -> Shot:

@@ -48,13 +48,13 @@ def read(paths: list[Path]) -> Shots:
     ):
         raise NoCameras("it is no file of cameras of Metashape")
     chunk = max(chunks, key=lambda each: sum(1 for _ in each.iterfind(".//cameras//camera/transform")))
-    found = _shots(chunk)
+    shots = _shots(chunk)
     if len(chunks) > 1:
-        found.warnings.append(
+        shots.warnings.append(
             f"Of {len(chunks)} chunks of Metashape, {chunk.get('label') or 'one'!r} is used, which has the most "
             "cameras."
         )
-    return found
+    return shots
 
 
 def _shots(chunk: ElementTree.Element) -> Shots:
@@ -133,11 +133,11 @@ def _similarity(element: ElementTree.Element | None) -> tuple[float, Float, Floa
 
 def _calibration(sensor: ElementTree.Element) -> ElementTree.Element:
     """The adjusted calibration of a sensor, or else its initial one. Raises ValueError without any."""
-    found = sensor.findall("calibration")
-    adjusted = [each for each in found if each.get("class") == "adjusted"]
-    if not found:
+    calibrations = sensor.findall("calibration")
+    adjusted = [each for each in calibrations if each.get("class") == "adjusted"]
+    if not calibrations:
         raise ValueError(f"the sensor {sensor.get('label')!r} has no calibration; align the photos first")
-    return (adjusted or found)[0]
+    return (adjusted or calibrations)[0]
 
 
 def _values(calibration: ElementTree.Element) -> dict[str, float]:

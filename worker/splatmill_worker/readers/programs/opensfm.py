@@ -43,20 +43,20 @@ def read(paths: list[Path]) -> Shots:
     if not models or not all(isinstance(each.get("cameras"), dict) for each in models):
         raise NoCameras("it has no shots and cameras, as a reconstruction of OpenSfM has")
     model = max(models, key=lambda each: len(each["shots"]))
-    found = _shots(model)
+    shots = _shots(model)
     if len(models) > 1:
-        found.warnings.append(
+        shots.warnings.append(
             f"Of {len(models)} reconstructions of OpenSfM, the one with the most photos is used, "
             f"{len(model['shots'])}."
         )
-    return found
+    return shots
 
 
 def _shots(model: dict[str, Any]) -> Shots:
     if len(model["shots"]) > MOST_SHOTS:
         raise ValueError(f"it has more than {MOST_SHOTS} shots")
     lenses: dict[str, Lens] = {}
-    found = Shots([])
+    cameras = Shots([])
     instances = model.get("rig_instances") or {}
     rigid = model.get("rig_cameras") or {}
     for name, shot in model["shots"].items():
@@ -68,22 +68,22 @@ def _shots(model: dict[str, Any]) -> Shots:
         if "rotation" not in shot or "translation" not in shot:
             raise ValueError(f"the shot {name[:80]!r} has no rotation and translation")
         if _of_rig(shot, instances, rigid):
-            found.left_out.append((name, "it is a part of a rig of OpenSfM, and those are not read"))
+            cameras.left_out.append((name, "it is a part of a rig of OpenSfM, and those are not read"))
             continue
         try:
             rotation = _rotation(_three(shot["rotation"], "its rotation"))
             translation = np.array(_three(shot["translation"], "its translation"))
         except ValueError as error:
-            found.faulty.append((name, str(error)))
+            cameras.faulty.append((name, str(error)))
             continue
         pose = tuple(np.hstack([rotation, translation[:, None]]).ravel().tolist())
         model_name, focal, offset, distortion, size = lenses[key]
-        found.shots.append(Shot(name, pose, model_name, focal, offset, distortion, size, relative=True))
+        cameras.shots.append(Shot(name, pose, model_name, focal, offset, distortion, size, relative=True))
     points = [each for each in (model.get("points") or {}).values() if isinstance(each, dict)]
-    found.points = np.array([_three(each.get("coordinates"), "a point") for each in points]).reshape(-1, 3)
+    cameras.points = np.array([_three(each.get("coordinates"), "a point") for each in points]).reshape(-1, 3)
     colors = [_three(each.get("color") or (128, 128, 128), "the colour of a point") for each in points]
-    found.colors = np.clip(np.array(colors).reshape(-1, 3), 0, 255).astype(np.uint8)
-    return found
+    cameras.colors = np.clip(np.array(colors).reshape(-1, 3), 0, 255).astype(np.uint8)
+    return cameras
 
 
 def _of_rig(shot: dict[str, Any], instances: dict[str, Any], cameras: dict[str, Any]) -> bool:

@@ -62,12 +62,12 @@ def read_csv(paths: list[Path]) -> Shots:
     height = "alt" if "alt" in columns else "z"
     if not {*REQUIRED, height, "name"} <= set(columns):
         raise NoCameras("it is no table of internal and external parameters of RealityScan")
-    found = Shots([])
+    cameras = Shots([])
     # With semicolons between values, a comma is that of a number.
     for row in csv.reader(io.StringIO("\n".join(lines[1:])), delimiter=separator):
         value = dict(zip(columns, row, strict=False))
         name = value.get("name", "").strip()
-        if len(found.shots) >= MOST_SHOTS:
+        if len(cameras.shots) >= MOST_SHOTS:
             raise ValueError(f"it has more than {MOST_SHOTS} cameras")
         if len(row) != len(columns) or not name:
             raise ValueError(
@@ -75,10 +75,10 @@ def read_csv(paths: list[Path]) -> Shots:
                 f"{len(columns)} names: the file is cut off, or its decimals are written with commas"
             )
         try:
-            found.shots.append(_of_row(name, value, height, decimal="," if separator == ";" else "."))
+            cameras.shots.append(_of_row(name, value, height, decimal="," if separator == ";" else "."))
         except ValueError as error:
-            found.faulty.append((name, str(error)))
-    return found
+            cameras.faulty.append((name, str(error)))
+    return cameras
 
 
 def _of_row(name: str, value: dict[str, str], height: str, *, decimal: str) -> Shot:
@@ -97,7 +97,7 @@ def _of_row(name: str, value: dict[str, str], height: str, *, decimal: str) -> S
 
 def read_xmp(paths: list[Path]) -> Shots:
     """The cameras of all files with a pose; a photo has the name of its file. Raises NoCameras where none has one."""
-    found = Shots([])
+    cameras = Shots([])
     without = 0
     for path in paths:
         try:
@@ -106,14 +106,14 @@ def read_xmp(paths: list[Path]) -> Shots:
             without += 1
             continue
         except ValueError as error:
-            found.faulty.append((path.stem, f"in {path.name}, {error}"))
+            cameras.faulty.append((path.stem, f"in {path.name}, {error}"))
             continue
-        found.shots.append(shot)
-    if not found.shots and not found.faulty:
+        cameras.shots.append(shot)
+    if not cameras.shots and not cameras.faulty:
         raise NoCameras("none of the XMP files has a camera of RealityScan")
     if without:
-        found.notes.append(f"XMP files without a camera of RealityScan: {without}.")
-    return found
+        cameras.notes.append(f"XMP files without a camera of RealityScan: {without}.")
+    return cameras
 
 
 def _of_xmp(path: Path) -> Shot:

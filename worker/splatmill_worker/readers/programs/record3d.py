@@ -45,7 +45,7 @@ def read(paths: list[Path]) -> Shots:
         raise ValueError(
             f"it has {len(poses)} poses, and perFrameIntrinsicCoeffs for another number of photos"
         )
-    found = Shots([])
+    cameras = Shots([])
     for index, pose in enumerate(poses):
         fx, fy, cx, cy = _numbers(own[index], 4, f"the lens of {index}") if own else (k[0], k[4], k[6], k[7])
         if not min(fx, fy) > 0.0:
@@ -54,12 +54,12 @@ def read(paths: list[Path]) -> Shots:
             x, y, z, w, *place = _numbers(pose, 7, f"the pose of {index}")
             rotation = (rotation_of_quaternion(w, x, y, z) @ FLIP).T
         except ValueError as error:
-            found.faulty.append((str(index), str(error)))
+            cameras.faulty.append((str(index), str(error)))
             continue
         offset = cx - 0.5 * width, cy - 0.5 * height
         pose = pose_of(rotation, place)
-        found.shots.append(Shot(str(index), pose, PINHOLE, (fx, fy), offset, (), (width, height)))
-    return found
+        cameras.shots.append(Shot(str(index), pose, PINHOLE, (fx, fy), offset, (), (width, height)))
+    return cameras
 
 
 def _numbers(value: Any, count: int, what: str) -> list[float]:

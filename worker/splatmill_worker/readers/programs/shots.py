@@ -187,13 +187,13 @@ def brown(
         return RATIONAL, (k1, k2, *tangential, k3, 0.0, 0.0, 0.0)
     radii = np.linspace(0.0, reach, 400)
     factor = 1.0 + np.stack([radii ** (2 * order) for order in (1, 2, 3, 4)], axis=1) @ [k1, k2, k3, k4]
-    found = ratio(radii, factor)
-    if found is None:
+    coefficients = ratio(radii, factor)
+    if coefficients is None:
         raise ValueError(
             f"its lens has a fourth radial coefficient, k4 = {k4:.4g}, which no camera model here has, and for which "
             "no other coefficients can stand; align again without k4, or export undistorted photos"
         )
-    return RATIONAL, (*found[:2], *tangential, *found[2:])
+    return RATIONAL, (*coefficients[:2], *tangential, *coefficients[2:])
 
 
 MOST_DIFFERENT = 1e-5

@@ -52,11 +52,11 @@ def read(paths: list[Path]) -> Shots:
         )
     models: list[Shots] = []
     while count := _count(lines, "cameras", models != []):
-        found = Shots([])
+        model = Shots([])
         for index in range(count):
-            _camera(found, _next(lines, f"camera {index} of {count}"), version == "NVM_V3_R9T")
-        found.points, found.colors = _points(lines, _count(lines, "points", True))
-        models.append(found)
+            _camera(model, _next(lines, f"camera {index} of {count}"), version == "NVM_V3_R9T")
+        model.points, model.colors = _points(lines, _count(lines, "points", True))
+        models.append(model)
     best = max(models, key=lambda model: len(model.shots))
     if len(models) > 1:
         best.warnings.append(
@@ -82,7 +82,7 @@ def _next(lines: Iterator[str], what: str) -> str:
     return line
 
 
-def _camera(found: Shots, line: str, matrix: bool) -> None:
+def _camera(cameras: Shots, line: str, matrix: bool) -> None:
     count = 15 if matrix else 10
     words = line.rsplit(None, count)
     if len(words) != count + 1:
@@ -100,20 +100,20 @@ def _camera(found: Shots, line: str, matrix: bool) -> None:
             pose = pose_of(rotation_of_quaternion(*values[1:5]), values[5:8])
         model, distortion = _lens(r)
     except ValueError as error:
-        found.faulty.append((name, str(error)))
+        cameras.faulty.append((name, str(error)))
         return
-    found.shots.append(Shot(name, pose, model, (focal, focal), (0.0, 0.0), distortion))
+    cameras.shots.append(Shot(name, pose, model, (focal, focal), (0.0, 0.0), distortion))
 
 
 def _lens(r: float) -> tuple[str, tuple[float, ...]]:
     if not r:
         return PINHOLE, ()
     places = np.linspace(0.0, REACH if r > 0.0 else min(REACH, PART / math.sqrt(-3.0 * r)), 400)
-    seen = 1.0 + r * places**2
-    found = ratio(places * seen, 1.0 / seen)
-    if found is None:
+    factor = 1.0 + r * places**2
+    coefficients = ratio(places * factor, 1.0 / factor)
+    if coefficients is None:
         raise ValueError(f"its lens has r = {r:.4g}, which is too strong for the camera models that are read")
-    return RATIONAL, (*found[:2], 0.0, 0.0, *found[2:])
+    return RATIONAL, (*coefficients[:2], 0.0, 0.0, *coefficients[2:])
 
 
 def _points(lines: Iterator[str], count: int) -> tuple[Float, npt.NDArray[np.uint8]]:

@@ -64,8 +64,8 @@ class Mirror:
         self._copy_files([run / name for name in names])
         began = time.monotonic()
         if (all_files or began >= self._checkpoint_at) and self._copy_files([run / CHECKPOINTS]):
-            took = time.monotonic() - began
-            self._checkpoint_at = began + max(CHECKPOINT_INTERVAL, took / CHECKPOINT_SHARE)
+            seconds = time.monotonic() - began
+            self._checkpoint_at = began + max(CHECKPOINT_INTERVAL, seconds / CHECKPOINT_SHARE)
 
     def _copy_files(self, places: list[Path]) -> int:
         """Copy what has changed in files and folders, and return the number of files copied."""

@@ -21,8 +21,8 @@ _RECORD, _PREVIEW = "job.json", "preview.jpg"
 
 def _in_folders(out: Path) -> list[str]:
     """Return the names of the files in the folders of a model."""
-    found = (path.relative_to(out).as_posix() for path in sorted(out.glob("*/*")))
-    return [name for name in found if layout.model_media_type(name) is not None]
+    names = (path.relative_to(out).as_posix() for path in sorted(out.glob("*/*")))
+    return [name for name in names if layout.model_media_type(name) is not None]
 
 
 RECORD_BYTES = 64 << 10

@@ -89,22 +89,22 @@ class StoredUnits:
         self,
         folder: PlanFolder,
         only: Collection[str] | None = None,
-        check: Callable[[Mapping[Path, Entry]], None] = lambda wanted: None,
+        check: Callable[[Mapping[Path, Entry]], None] = lambda files: None,
     ) -> list[tuple[str, int]]:
         """Copy the outputs that the folder of the plan lacks into it. Return the names and sizes of their files.
 
         only: names of the units whose outputs are wanted; None: all.
         check: called with the files of an output and where they will be, before these are copied.
         """
-        wanted: dict[str, dict[str, Entry]] = defaultdict(dict)
+        outputs: dict[str, dict[str, Entry]] = defaultdict(dict)
         for entry in self._storage.entries(self._prefix):
             output, _, name = entry.path.removeprefix(f"{self._prefix}/").partition("/")
             if only is not None and output.rpartition("-")[0] not in only:
                 continue
             if name and not (folder.root / UNITS / output / DONE).is_file():
-                wanted[output][name] = entry
+                outputs[output][name] = entry
         brought = []
-        for output, files in wanted.items():
+        for output, files in outputs.items():
             if DONE not in files:
                 continue  # it is being stored
             part = folder.root / UNITS / f".{output}.part"

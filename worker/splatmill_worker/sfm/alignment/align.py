@@ -130,11 +130,11 @@ def align(
     scene = Cloud.of(scene_points[rows] - about, scene_colors[rows])
     if not (scan.radius > 0.0 and scene.radius > 0.0):
         return Unaligned("more than half of the points lie at one place")
-    found = _search(scene, scan, random, on_progress, cancelled)
-    if found is None:
+    guess = _search(scene, scan, random, on_progress, cancelled)
+    if guess is None:
         return Unaligned("no part of it has the shape and the colours of a part of the scene")
     normals = icp.normals_of(scan)
-    best = _finished(scene, scan, found, normals)
+    best = _finished(scene, scan, guess, normals)
     mirrored = _finished(scene, *_mirrored(scene, scan, best.similarity), normals=None)
     if mirrored.share > max(EVIDENT, MIRRORED * best.share):
         return Unaligned(
@@ -162,12 +162,12 @@ def _finished(scene: Cloud, scan: Cloud, first: Similarity, normals: Float | Non
     limit = max(3.0 * NEAR * scene.radius, 3.0 * scan.spacing * first.scale)
     nearer = icp.refined(scene, scan, first, limit, 10)
     best = icp.refined(scene, scan, nearer, limit, 20, normals)
-    found = icp.pairs(scene, scan, best, _near(scene, scan, best))
-    if not len(found.rows):
+    matches = icp.pairs(scene, scan, best, _near(scene, scan, best))
+    if not len(matches.rows):
         return Aligned(best, 0.0, float("inf"))
-    apart = scene.points[found.rows] - best.points(scan.points[found.partners])
-    off = np.abs((apart * (normals[found.partners] @ best.rotation.T)).sum(axis=1)) / best.scale
-    return Aligned(best, len(found.rows) / len(scene.points), float(np.median(off)))
+    apart = scene.points[matches.rows] - best.points(scan.points[matches.partners])
+    off = np.abs((apart * (normals[matches.partners] @ best.rotation.T)).sum(axis=1)) / best.scale
+    return Aligned(best, len(matches.rows) / len(scene.points), float(np.median(off)))
 
 
 def _near(scene: Cloud, scan: Cloud, similarity: Similarity) -> float:

@@ -19,12 +19,12 @@ def spread(points: Float, most: int) -> npt.NDArray[np.intp]:
     rows = in_cells(points, high)
     for _ in range(SEARCHES):
         cell = 0.5 * (low + high) if low > 0.0 else high / 4.0
-        found = in_cells(points, cell)
-        if len(found) > most:
+        trial = in_cells(points, cell)
+        if len(trial) > most:
             low = cell
         else:
-            high, rows = cell, found
-            if len(found) > 0.9 * most:
+            high, rows = cell, trial
+            if len(trial) > 0.9 * most:
                 break
     return rows
 

@@ -74,19 +74,19 @@ def refined(
     normals: of the scan's surfaces [n,3]; None: distances to points alone count, which converges from farther away.
     """
     for _ in range(steps):
-        found = pairs(scene, scan, similarity, limit)
-        if len(found.rows) < FEWEST:
+        matches = pairs(scene, scan, similarity, limit)
+        if len(matches.rows) < FEWEST:
             return similarity
-        source, target = scan.points[found.partners], scene.points[found.rows]
+        source, target = scan.points[matches.partners], scene.points[matches.rows]
         step = (
             _to_points(source, target)
             if normals is None
-            else _to_planes(similarity, source, normals[found.partners], target, limit)
+            else _to_planes(similarity, source, normals[matches.partners], target, limit)
         )
         if step is None:
             return similarity
         similarity = step
-        least = max(1.5 * scan.spacing * similarity.scale, 3.0 * float(np.median(found.distances)))
+        least = max(1.5 * scan.spacing * similarity.scale, 3.0 * float(np.median(matches.distances)))
         limit = min(limit, max(0.8 * limit, least))
     return similarity
 
@@ -108,10 +108,10 @@ def _to_points(source: Float, target: Float) -> Similarity | None:
     The scale of least squares is too small where pairs are wrong: errors shrink the covariance, not the spreads (Horn
     1987).
     """
-    found = umeyama(source, target)
-    if found is None:
+    fit = umeyama(source, target)
+    if fit is None:
         return None
-    rotation = found[0]
+    rotation = fit[0]
     a, b = source - source.mean(axis=0), target - target.mean(axis=0)
     scale = float(np.sqrt((b**2).sum() / (a**2).sum()))
     return Similarity(rotation, scale, target.mean(axis=0) - scale * rotation @ source.mean(axis=0))

@@ -67,10 +67,10 @@ def guesses(
     corners = _triangle(scene, palette, random)
     if corners is None:
         return []
-    found = _same_shape(scene, scan, palette, corners, random)
-    if found is None:
+    similarities = _same_shape(scene, scan, palette, corners, random)
+    if similarities is None:
         return []
-    rotations, scales, translations = found
+    rotations, scales, translations = similarities
     around = _around(scene, corners, random)
     for count, kept in ((FIRST, BEST), (THEN, most)):
         score = _agreement(scene, scan, around[:count], rotations, scales, translations)

@@ -34,7 +34,7 @@ class Maps:
     names: frozenset[str]
 
 
-def found(folders: Sequence[Path], views: Sequence[View]) -> Maps:
+def maps_of(folders: Sequence[Path], views: Sequence[View]) -> Maps:
     """The maps under some folders, by the folders that they lie in and by the views that name their own.
 
     The map of `images/a.jpg` is `depth/a.png`. Where several photos are called alike, their folders decide; where these

@@ -36,23 +36,25 @@ def without_large_features(model: pycolmap.Reconstruction, scales: Scales) -> py
 
     None where all observations are kept.
     """
-    found = _Observations.of(model, scales)
-    if found is None:
+    measurements = _Observations.of(model, scales)
+    if measurements is None:
         return None
-    first = found.rank_in_photo() < KEPT_OBSERVATIONS
+    first = measurements.rank_in_photo() < KEPT_OBSERVATIONS
     others = np.flatnonzero(~first)
-    others = others[np.argsort(found.scale[others], kind="stable")]
-    errors = found.error[first].sum() + np.concatenate([[0.0], np.cumsum(found.error[others])])
+    others = others[np.argsort(measurements.scale[others], kind="stable")]
+    errors = measurements.error[first].sum() + np.concatenate([[0.0], np.cumsum(measurements.error[others])])
     count = int(np.argmin(errors / (first.sum() + np.arange(len(others) + 1)) ** 2))
-    limit = found.scale[others[count - 1]] if count else -np.inf
-    kept = first | (found.scale <= limit)
-    of_point = np.bincount(found.point, kept)
-    alone = np.unique(found.point[first & (of_point[found.point] == 1)])
-    kept |= np.isin(found.point, alone)
+    limit = measurements.scale[others[count - 1]] if count else -np.inf
+    kept = first | (measurements.scale <= limit)
+    of_point = np.bincount(measurements.point, kept)
+    alone = np.unique(measurements.point[first & (of_point[measurements.point] == 1)])
+    kept |= np.isin(measurements.point, alone)
     if kept.all():
         return None
     result = copy.deepcopy(model)
-    for image_id, number in zip(found.photo[~kept].tolist(), found.number[~kept].tolist(), strict=True):
+    for image_id, number in zip(
+        measurements.photo[~kept].tolist(), measurements.number[~kept].tolist(), strict=True
+    ):
         if result.images[image_id].points2D[number].has_point3D():
             result.delete_observation(image_id, number)
     result.update_point_3d_errors()

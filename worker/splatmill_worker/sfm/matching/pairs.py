@@ -83,9 +83,9 @@ def numbered_runs(photos: Sequence[UsablePhoto]) -> list[list[int]]:
     """
     runs: dict[str, list[tuple[int, int]]] = {}
     for index, photo in enumerate(photos):
-        found = NUMBERED_NAME.match(photo.name) if photo.sequence is None else None
-        if found is not None:
-            runs.setdefault(found[1], []).append((int(found[2]), index))
+        match = NUMBERED_NAME.match(photo.name) if photo.sequence is None else None
+        if match is not None:
+            runs.setdefault(match[1], []).append((int(match[2]), index))
     return [[index for _, index in sorted(run)] for run in runs.values() if len(run) >= MIN_NUMBERED_RUN]
 
 

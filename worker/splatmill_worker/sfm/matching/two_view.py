@@ -112,14 +112,14 @@ def match_pairs(
     options.ransac.max_error = max_error(longest)
     matcher = Matcher(features)
     ordered = sorted(chosen)
-    found: dict[Pair, TwoView] = {}
+    outcomes: dict[Pair, TwoView] = {}
     fresh: list[Pair] = []
     for pair in ordered:
         stored = _stored(database, ids, pair)
         if stored is None:
             fresh.append(pair)
         else:
-            found[pair] = stored
+            outcomes[pair] = stored
 
     def work(pair: Pair) -> tuple[Matches, pycolmap.TwoViewGeometry | None]:
         if cancelled():
@@ -144,9 +144,9 @@ def match_pairs(
         if geometry is None:
             geometry = pycolmap.TwoViewGeometry()
         database.write_two_view_geometry(first, second, geometry)
-        found[pair] = TwoView(len(matches), len(geometry.inlier_matches), int(geometry.config))
-        on_progress(len(found), len(ordered))
-    return found
+        outcomes[pair] = TwoView(len(matches), len(geometry.inlier_matches), int(geometry.config))
+        on_progress(len(outcomes), len(ordered))
+    return outcomes
 
 
 def _stored(database: pycolmap.Database, ids: dict[int, int], pair: Pair) -> TwoView | None:

@@ -76,8 +76,8 @@ def load_largest(folders: Sequence[Path], files: ImageFiles, notes: tuple[str, .
 
 
 def _path(files: ImageFiles, name: str) -> Path | None:
-    found = files.photo(name)
-    return None if found is None else found[1]
+    photo = files.photo(name)
+    return None if photo is None else photo[1]
 
 
 def _shown(folder: Path) -> str:
@@ -97,11 +97,11 @@ def scene_of_given(
     lacking: list[tuple[str, str]] = []
     unusable: dict[Path, tuple[str, str]] = {}
     for image_id, image in sorted(model.images.items(), key=lambda item: item[1].name):
-        found = files.photo(image.name)
-        if found is None:
+        photo = files.photo(image.name)
+        if photo is None:
             lacking.append((image.name, missing(image.name, files, f"{model.what} has a camera for it")))
             continue
-        name, path = found
+        name, path = photo
         try:
             views[image_id] = _view(image, name, path, files.mask(name))
         except UnusablePicture as error:
@@ -118,7 +118,7 @@ def scene_of_given(
             + " Give the photos the names that the model uses."
         )
     copies, copy_warnings = files.copies({view.image for view in views.values()})
-    faulty = {found[1]: fault for name, fault in model.faulty if (found := files.photo(name)) is not None}
+    faulty = {photo[1]: fault for name, fault in model.faulty if (photo := files.photo(name)) is not None}
     views, contradictory = one_for_each(views, lambda key: f"image {key} ({model.images[key].name})")
     faulty |= {files.photos[name]: fault for name, fault in contradictory}
     used = {view.image for view in views.values()}

@@ -21,7 +21,7 @@ def decoded(model: GivenModel, files: ImageFiles) -> tuple[GivenModel, tuple[str
     Raises NamesUnclear.
     """
     names = {image.name for image in model.images.values()} | {name for name, _ in model.faulty}
-    stored = {name: found[0] for name in names if not_utf8(name) and (found := files.photo(name)) is not None}
+    stored = {name: photo[0] for name in names if not_utf8(name) and (photo := files.photo(name)) is not None}
     model = _named(model, stored)
     unclear = {name: raw for name in sorted(names - stored.keys()) if (raw := not_utf8(name)) is not None}
     if not unclear:
@@ -53,13 +53,13 @@ def chosen(
     Raises NamesUnclear where two encodings lead to different photos.
     """
     photos = {
-        encoding: {key: found[0] for key, text in names.items() if (found := files.photo(text)) is not None}
+        encoding: {key: photo[0] for key, text in names.items() if (photo := files.photo(text)) is not None}
         for encoding, names in readings.items()
     }
     most = max(map(len, photos.values()), default=0)
     if not most:
         return None, ()
-    first, *others = [encoding for encoding, found in photos.items() if len(found) == most]
+    first, *others = [encoding for encoding, names in photos.items() if len(names) == most]
     for other in others:
         for key, name in readings[first].items():
             if photos[other].get(key) != photos[first].get(key):

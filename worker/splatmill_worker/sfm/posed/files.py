@@ -50,14 +50,14 @@ class ImageFiles:
             if (path := directory / name).suffix.lower() in PHOTO_SUFFIXES and path.is_file()
         }
         inside = {name: inner for name in pictures if (inner := without_mask_folder(name)) is not None}
-        found = {
+        candidates = {
             path.relative_to(root).as_posix(): path
             for name, path in pictures.items()
             if name not in inside and path.is_relative_to(root)
         }
-        beside = {name: found[name] for name in masks_beside(found)}
+        beside = {name: candidates[name] for name in masks_beside(candidates)}
         masks = {inner.removeprefix("images/"): pictures[name] for name, inner in inside.items()}
-        photos = {name: path for name, path in found.items() if name not in beside}
+        photos = {name: path for name, path in candidates.items() if name not in beside}
         return ImageFiles(root, photos, beside | masks)
 
     def photo(self, name: str) -> tuple[str, Path] | None:
@@ -69,8 +69,8 @@ class ImageFiles:
         (images_2/, images_4/), it is the largest. A photo that was renamed for storage is found by the name it had.
         """
         best = self.candidates(name)
-        found = best[0] if len(best) == 1 else self._largest(best)
-        return (found, self.photos[found]) if found is not None else None
+        match = best[0] if len(best) == 1 else self._largest(best)
+        return (match, self.photos[match]) if match is not None else None
 
     def copies(self, used: Set[Path]) -> tuple[frozenset[Path], tuple[str, ...]]:
         """The photos that are smaller copies of those of `used`, and a sentence for each of their folders."""
@@ -95,17 +95,17 @@ class ImageFiles:
 
     def named_mask(self, name: str) -> Path | None:
         """The mask that a file of cameras names; None when there is none, or no single one."""
-        return next((found for path in readings(name) if (found := self._mask_at(path)) is not None), None)
+        return next((mask for path in readings(name) if (mask := self._mask_at(path)) is not None), None)
 
     def _mask_at(self, path: str) -> Path | None:
         """The mask with the most trailing parts as `path`, if it is the only one."""
         parts = [part for part in folded(path).split("/") if part not in (".", "..", "")]
         inner = without_mask_folder("/".join(parts))
-        for wanted in [parts] if inner is None else [inner.split("/"), parts]:
-            for length in range(len(wanted), 0, -1):
-                found = self._masks_by_end.get(tuple(wanted[-length:]), [])
-                if len(found) == 1:
-                    return self.masks[found[0]]
+        for target in [parts] if inner is None else [inner.split("/"), parts]:
+            for length in range(len(target), 0, -1):
+                names = self._masks_by_end.get(tuple(target[-length:]), [])
+                if len(names) == 1:
+                    return self.masks[names[0]]
         return None
 
     @property
@@ -148,20 +148,20 @@ class ImageFiles:
                 break
         return best
 
-    def _best(self, wanted: list[str], key: Callable[[str], str]) -> list[str]:
-        """Names of the photos with the most trailing parts as `wanted`, by the `key` of each part."""
+    def _best(self, target: list[str], key: Callable[[str], str]) -> list[str]:
+        """Names of the photos with the most trailing parts as `target`, by the `key` of each part."""
         best: list[str] = []
         best_length = 0
-        for candidate in self._by_last_part(wanted[-1] if wanted else "", key):
+        for candidate in self._by_last_part(target[-1] if target else "", key):
             parts = [key(part) for part in PurePosixPath(candidate).parts]
             length = 1
-            while length < min(len(parts), len(wanted)) and parts[-1 - length] == wanted[-1 - length]:
+            while length < min(len(parts), len(target)) and parts[-1 - length] == target[-1 - length]:
                 length += 1
             if length > best_length:
                 best, best_length = [candidate], length
             elif length == best_length:
                 best.append(candidate)
-        exact = [name for name in best if [key(part) for part in PurePosixPath(name).parts] == wanted]
+        exact = [name for name in best if [key(part) for part in PurePosixPath(name).parts] == target]
         return exact if len(exact) == 1 else best
 
     def _largest(self, names: list[str]) -> str | None:
@@ -248,7 +248,7 @@ def none_usable(unusable: Sequence[tuple[str, str]]) -> Refusal:
     )
 
 
-def missing(name: str, files: ImageFiles, given: str) -> str:
-    """Why no photo is used for a name that has a camera. given: what has the camera."""
+def missing(name: str, files: ImageFiles, fact: str) -> str:
+    """Why no photo is used for a name that has a camera. fact: what has the camera."""
     several = alternatives(name, files)
-    return f"{given}, and {several}" if several else f"{given}, but the capture has no such photo"
+    return f"{fact}, and {several}" if several else f"{fact}, but the capture has no such photo"

@@ -113,5 +113,5 @@ def _grid(camera: Camera, distance: float) -> tuple[Float, Float, Float]:
 
 
 def _pixels(camera: Camera, points: Float) -> Float:
-    seen = camera.project(points)
-    return np.array([seen.columns, seen.rows])
+    projection = camera.project(points)
+    return np.array([projection.columns, projection.rows])

@@ -68,7 +68,7 @@ def load(
     Raises ValueError, naming the file and the frame, for an invalid camera and for photos with different cameras, and
     when no photo is among `files`.
     """
-    given: dict[int, View] = {}
+    all_views: dict[int, View] = {}
     where: dict[int, str] = {}
     named: dict[Path, set[Part]] = {}
     left_out: list[tuple[str, str]] = []
@@ -112,8 +112,8 @@ def load(
             if view is None:
                 left_out.append((name, missing(name, files, f"{path.name} has a camera for it")))
                 continue
-            where[len(given)] = f"frame {index} of {path.name}"
-            given[len(given)] = view
+            where[len(all_views)] = f"frame {index} of {path.name}"
+            all_views[len(all_views)] = view
             if view.mask is None and frame.get("mask_path"):
                 unmasked.append(str(frame["mask_path"]))
             own = {part} if part else listed_in.get(parts.plain(name), set())
@@ -133,7 +133,7 @@ def load(
         if document.get("ply_file_path"):
             points, note = _sparse_points(path.parent, str(document["ply_file_path"]), capture)
             warnings += [note] if note else []
-    distinct, contradictory = one_for_each(given, where.__getitem__)
+    distinct, contradictory = one_for_each(all_views, where.__getitem__)
     left_out += contradictory
     views, validation, remarks = parts.divided(distinct.values(), named)
     left_out += [(name, parts.NOT_USED) for name in validation]
@@ -225,9 +225,9 @@ def _with_stored_names(text: bytes, files: ImageFiles) -> Any:
     with suppress(ValueError):
         paths = _file_paths(json.loads(text.decode("utf-8", "surrogateescape")))
         stored = {
-            index: found[0]
+            index: match[0]
             for index, path in paths.items()
-            if not_utf8(path) and (found := files.photo(path)) is not None
+            if not_utf8(path) and (match := files.photo(path)) is not None
         }
         if stored:
             document = json.loads(text.decode("utf-8", "replace"))
@@ -261,10 +261,10 @@ def _view(
             f"Frame {index} of {path.name} has no file_path; each frame needs the name of its photo."
         )
     name = frame["file_path"]
-    found = files.photo(name)
-    if found is None:
+    match = files.photo(name)
+    if match is None:
         return name, None
-    relative, photo = found
+    relative, photo = match
     values = {**document, **frame}
     try:
         viewmat = world_to_camera(_matrix(frame["transform_matrix"]))
@@ -310,8 +310,8 @@ def _has_no_pose(frame: Any) -> bool:
 def _photo(frame: Any, files: ImageFiles) -> Path | None:
     """The photo of a frame, if it names one of the capture."""
     name = frame.get("file_path") if isinstance(frame, dict) else None
-    found = files.photo(name) if isinstance(name, str) else None
-    return None if found is None else found[1]
+    match = files.photo(name) if isinstance(name, str) else None
+    return None if match is None else match[1]
 
 
 def _called(index: int, frame: Any, files: ImageFiles) -> str:
@@ -319,8 +319,8 @@ def _called(index: int, frame: Any, files: ImageFiles) -> str:
     name = frame.get("file_path") if isinstance(frame, dict) else None
     if not isinstance(name, str):
         return f"frame {index}"
-    found = files.photo(name)
-    return name if found is None else found[0]
+    match = files.photo(name)
+    return name if match is None else match[0]
 
 
 def _file(folder: Path, name: str, capture: Path) -> Path | None:
@@ -400,12 +400,12 @@ def _number(values: dict[str, Any], key: str, default: float | None = None) -> f
 
 def _either(values: dict[str, Any], key: str, other: str) -> float | None:
     """The number in one of two fields that mean the same. Raises ValueError where both have one and these differ."""
-    given, same = _number(values, key), _number(values, other)
-    if given is not None and same is not None and given != same:
+    value, same = _number(values, key), _number(values, other)
+    if value is not None and same is not None and value != same:
         raise ValueError(
-            f"{key} is {given:g} and {other} is {same:g}, which mean the same; leave the wrong one out"
+            f"{key} is {value:g} and {other} is {same:g}, which mean the same; leave the wrong one out"
         )
-    return same if given is None else given
+    return same if value is None else value
 
 
 def _matrix(rows: Any) -> npt.NDArray[np.float64]:
@@ -423,9 +423,11 @@ def _colmap_camera(values: dict[str, Any], size: tuple[int, int]) -> pycolmap.Ca
         return panorama(width, height)
 
     def focal(length: str, other: str, angle: str, side: int) -> float | None:
-        given, seen = _either(values, length, other), _number(values, angle)
+        pixels, opening = _either(values, length, other), _number(values, angle)
         return (
-            given if given is not None or seen is None else 0.5 * side / math.tan(0.5 * radians(angle, seen))
+            pixels
+            if pixels is not None or opening is None
+            else 0.5 * side / math.tan(0.5 * radians(angle, opening))
         )
 
     horizontal = focal("fl_x", "fx", "camera_angle_x", width)
@@ -476,10 +478,10 @@ def _sparse_points(
             f"The points in {written}, which ply_file_path names, are not used: there is no such file.",
         )
     try:
-        found = decoders.call_once(point_file.read, path, check=_points_of, fault=_points_fault)
+        cloud = decoders.call_once(point_file.read, path, check=_points_of, fault=_points_fault)
     except (OSError, ValueError) as error:
         return nothing, f"The points in {path.name} are not used: {plain(error)}."
-    return found, None
+    return cloud, None
 
 
 def _points_of(answer: Any) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8]]:

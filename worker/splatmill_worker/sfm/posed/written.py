@@ -103,9 +103,9 @@ def camera_of(view: View) -> pycolmap.Camera:
     if view.lens is None:
         params = [camera.fx, camera.fy, camera.cx, camera.cy]
         return pycolmap.Camera(model="PINHOLE", width=camera.width, height=camera.height, params=params)
-    found = colmap_camera(view.lens)
-    found.rescale(camera.width, camera.height)
-    return found
+    lens_camera = colmap_camera(view.lens)
+    lens_camera.rescale(camera.width, camera.height)
+    return lens_camera
 
 
 def transforms_of(views: list[View], held_out: frozenset[str]) -> dict[str, Any] | None:
@@ -164,10 +164,10 @@ def _observed(views: list[View], points: Float, scene: Scene) -> list[npt.NDArra
     """For each view, the indices of the points that it observes; none where that is not known."""
     if scene.point_views is None:
         return [np.zeros(0, np.int64) for _ in views]
-    offsets, seen = scene.point_views
+    offsets, observers = scene.point_views
     owners = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
-    order = np.argsort(seen, kind="stable")
-    bounds = np.searchsorted(seen[order], np.arange(len(views) + 1))
+    order = np.argsort(observers, kind="stable")
+    bounds = np.searchsorted(observers[order], np.arange(len(views) + 1))
     return [owners[order[bounds[i] : bounds[i + 1]]].astype(np.int64) for i in range(len(views))]
 
 

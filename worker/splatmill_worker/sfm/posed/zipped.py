@@ -60,15 +60,15 @@ def cameras_beside(
 
     Raises as `data_set` does, and TwoFiles where two zips have cameras, or one has two of a program.
     """
-    found: dict[str, PosedInput] = {}
+    inputs: dict[str, PosedInput] = {}
     for name, folder in _zips_among_photos(capture, workdir, cancelled).items():
-        if not holds_media(walk(folder)) and (given := find(capture, folder)) is not None:
-            notes = (f"The cameras are those in {name}.", *given.notes)
-            found[name] = replace(given, notes=notes, archive=name, unpacked=folder)
-    if len(found) > 1:
-        first, second, *_ = found
+        if not holds_media(walk(folder)) and (cameras := find(capture, folder)) is not None:
+            notes = (f"The cameras are those in {name}.", *cameras.notes)
+            inputs[name] = replace(cameras, notes=notes, archive=name, unpacked=folder)
+    if len(inputs) > 1:
+        first, second, *_ = inputs
         raise TwoFiles(f"Cameras are in {first} and in {second}. Leave one of them out.")
-    return next(iter(found.values()), None)
+    return next(iter(inputs.values()), None)
 
 
 def unused_cameras(capture: Path, workdir: Path, cancelled: Callable[[], bool] = lambda: False) -> list[str]:

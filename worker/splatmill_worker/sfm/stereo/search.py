@@ -133,10 +133,10 @@ def find_points(
             near, far = DEFAULT_DEPTHS[0] * middle, DEFAULT_DEPTHS[1] * middle
         neighbours = _neighbours(index, float(middle), centers, axes)
         if len(neighbours) >= MIN_AGREEING and 0.0 < near < far:
-            found = sweep(grey[index], [grey[k] for k in neighbours], place, near, far)
-            batches.append(found)
-            shown.append(_Shown.of(found, used[[index, *neighbours]]))
-            known.add(found.points)
+            result = sweep(grey[index], [grey[k] for k in neighbours], place, near, far)
+            batches.append(result)
+            shown.append(_Shown.of(result, used[[index, *neighbours]]))
+            known.add(result.points)
         if done == len(trial) and _yield(batches) < MIN_YIELD:
             given_up, batches, shown = True, [], []
             break
@@ -162,10 +162,10 @@ class _Shown(NamedTuple):
     lengths: npt.NDArray[np.int64]
 
     @staticmethod
-    def of(found: SweepResult, numbers: npt.NDArray[np.int64]) -> _Shown:
+    def of(result: SweepResult, numbers: npt.NDArray[np.int64]) -> _Shown:
         """numbers: of the photo and of its neighbours."""
         order = np.argsort(numbers)
-        shows = np.column_stack([np.ones(len(found.points), bool), found.agreeing])[:, order]
+        shows = np.column_stack([np.ones(len(result.points), bool), result.agreeing])[:, order]
         return _Shown(numbers[order][np.nonzero(shows)[1]].astype(np.int32), shows.sum(axis=1))
 
 

@@ -124,8 +124,8 @@ def _down(scene: Scene, tags: Sequence[Exif]) -> Down:
     known = np.isfinite(places).all(axis=1)
     if down.doubt is None or not known.any():
         return down
-    found = georeference.fit(scene.centers[known], geodesy.local(places[known], places[known][0]))
-    by_gps = None if isinstance(found, str) else georeference.down_by(found)
+    fit = georeference.fit(scene.centers[known], geodesy.local(places[known], places[known][0]))
+    by_gps = None if isinstance(fit, str) else georeference.down_by(fit)
     return down if by_gps is None else Down(by_gps, 0, None)
 
 
@@ -176,13 +176,13 @@ def _located(level: Scene, tags: Sequence[Exif]) -> tuple[Similarity, Geographic
     has_altitude = bool(np.isfinite(places[known, 2]).all())
     places[~np.isfinite(places)] = 0.0
     base = np.median(places[known], axis=0)
-    found = georeference.fit(centers[known][:, [0, 2]], geodesy.local(places[known], base)[:, :2])
-    if isinstance(found, str):
-        return found
+    fit = georeference.fit(centers[known][:, [0, 2]], geodesy.local(places[known], base)[:, :2])
+    if isinstance(fit, str):
+        return fit
     # Altitudes are those above the ellipsoid or the sea, whichever the device gives; the difference is a constant.
-    agreeing = found.agreeing
-    heights = geodesy.local(places[known], base)[agreeing, 2] + found.scale * centers[known][agreeing, 1]
-    similarity = georeference.level_similarity(found, float(np.median(heights)) if has_altitude else 0.0)
+    agreeing = fit.agreeing
+    heights = geodesy.local(places[known], base)[agreeing, 2] + fit.scale * centers[known][agreeing, 1]
+    similarity = georeference.level_similarity(fit, float(np.median(heights)) if has_altitude else 0.0)
     focus = similarity.points(_focus(level))
     east, down, north = focus
     latitude, longitude, altitude = geodesy.place(np.array([east, north, -down]), base)
@@ -191,13 +191,13 @@ def _located(level: Scene, tags: Sequence[Exif]) -> tuple[Similarity, Geographic
         longitude=float(longitude),
         altitude=float(altitude) if has_altitude else None,
     )
-    counted = f"{int(agreeing.sum())} of {int(known.sum())} photos agree within {found.error:.1f} m"
-    covered = float(np.linalg.norm(found.spread))
+    counted = f"{int(agreeing.sum())} of {int(known.sum())} photos agree within {fit.error:.1f} m"
+    covered = float(np.linalg.norm(fit.spread))
     return (
         similarity.then(Similarity(np.eye(3), 1.0, -focus)),
         origin,
         f"The origin is the point that the cameras look at, located by GPS: {counted}.",
-        f"Metres, by GPS, to about {100 * found.error / covered / math.sqrt(agreeing.sum()):.1f} %: the photos cover "
+        f"Metres, by GPS, to about {100 * fit.error / covered / math.sqrt(agreeing.sum()):.1f} %: the photos cover "
         f"{covered:.0f} m (root mean square from their mean).",
     )
 

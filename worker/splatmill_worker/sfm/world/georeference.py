@@ -67,12 +67,12 @@ def fit(centers: Float, measured: Float) -> Fit | str:
     random = np.random.default_rng(0)
     for _ in range(TRIALS):
         sample = random.choice(count, dimensions, replace=False)
-        found = umeyama(centers[sample], measured[sample])
-        if found is None:
+        guess = umeyama(centers[sample], measured[sample])
+        if guess is None:
             continue
-        median = float(np.median(_errors(found, centers, measured)))
+        median = float(np.median(_errors(guess, centers, measured)))
         if median < least:
-            best, least = found, median
+            best, least = guess, median
     if best is None:
         return "the photos with GPS were taken at one place"
     # 1.4826 makes the median of one normal error its standard deviation; of a distance it is an upper bound.
@@ -118,23 +118,23 @@ def umeyama(source: Float, target: Float) -> tuple[Float, float, Float] | None:
     return rotation, scale, target.mean(axis=0) - scale * rotation @ source.mean(axis=0)
 
 
-def down_by(found: Fit) -> Float | None:
+def down_by(gps_fit: Fit) -> Float | None:
     """Down [3] in the world of the cameras by a fit in 3 dimensions; None where the photos lie too near to a line."""
-    if found.spread[1] < TILT * found.error:
+    if gps_fit.spread[1] < TILT * gps_fit.error:
         return None
-    down: Float = -found.rotation[2]
+    down: Float = -gps_fit.rotation[2]
     return down
 
 
-def level_similarity(found: Fit, height: float) -> Similarity:
+def level_similarity(gps_fit: Fit, height: float) -> Similarity:
     """The similarity of a fit in x and z of an upright world (y down) to metres to the east and north.
 
     height: metres that are added to the world's upward coordinate to get the altitude over the origin.
     """
     rotation = np.eye(3)
-    rotation[np.ix_([0, 2], [0, 2])] = found.rotation
-    east, north = found.translation
-    return Similarity(rotation, found.scale, np.array([east, -height, north]))
+    rotation[np.ix_([0, 2], [0, 2])] = gps_fit.rotation
+    east, north = gps_fit.translation
+    return Similarity(rotation, gps_fit.scale, np.array([east, -height, north]))
 
 
 def _errors(similarity: tuple[Float, float, Float], centers: Float, measured: Float) -> Float:

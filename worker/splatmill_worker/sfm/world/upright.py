@@ -127,12 +127,12 @@ def focus_of(centers: Float, axes: Float, points: Float) -> Float:
     if alignment < 1.0 - 1e-2:
         weights = np.ones(len(axes))
         for _ in range(20):
-            found = looked_at(centers, axes, ridge=0.0, weights=weights)
-            offsets = found - centers
+            point = looked_at(centers, axes, ridge=0.0, weights=weights)
+            offsets = point - centers
             across = offsets - np.einsum("nj,nj->n", offsets, axes)[:, None] * axes
             weights = 1.0 / np.maximum(np.linalg.norm(across, axis=1), 1e-3 * spread)
         if np.median(np.einsum("nj,nj->n", offsets, axes)) > 0.1 * spread:
-            return found
+            return point
     if len(points):
         median: Float = np.median(points, axis=0)
         return median

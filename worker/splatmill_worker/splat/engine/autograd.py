@@ -120,12 +120,12 @@ class AutogradEngine:
         if self._pending is None:
             raise RuntimeError("backward_update needs a forward pass before it.")
         projected, *outputs = self._pending
-        wanted = [
+        pairs = [
             (out, grad.to(out))
             for out, grad in zip(outputs, (d_color, d_alpha, d_depth), strict=True)
             if grad is not None
         ]
-        torch.autograd.backward([out for out, _ in wanted], [grad for _, grad in wanted])
+        torch.autograd.backward([out for out, _ in pairs], [grad for _, grad in pairs])
         height, width = outputs[0].shape[:2]
         self._score(projected, *((width, height) if part_of is None else part_of[:2]))
         twist = None if self._twist is None else self._twist.grad

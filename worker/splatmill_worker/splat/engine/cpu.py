@@ -72,7 +72,7 @@ class CpuEngine(Step):
         key: Hashable | None = None,
         part_of: PartOf | None = None,
     ) -> StepResult:
-        seen = self.train(
+        result = self.train(
             viewmat,
             K,
             None,
@@ -87,7 +87,7 @@ class CpuEngine(Step):
             pose_gradient=self.keep_pose_gradient,
             part_of=part_of,
         )
-        return StepResult(seen.loss, seen.visible)
+        return StepResult(result.loss, result.visible)
 
     def _stats(self, photo: Tensor, mask: Tensor | None, key: Hashable | None) -> PhotoStats:
         """The part of the loss that depends on the photo alone, kept under `key` while there is room."""

@@ -45,8 +45,8 @@ class GpuEngine(Step):
         """
         if part_of is not None:
             raise ValueError("part_of: the gpu engine trains on whole photos")
-        seen = self.train(
+        result = self.train(
             viewmat, K, photo, degree=degree, rates=rates, step=step, background=background, alpha=alpha, mask=mask,
             antialias=antialias,
         )  # fmt: skip
-        return StepResult(seen.loss, seen.visible)
+        return StepResult(result.loss, result.visible)

@@ -136,15 +136,15 @@ def _point_colors(gaussians: Gaussians) -> Array:
 
 def _contents(path: Path) -> Contents:
     document, data = _chunks(path)
-    found = [
+    primitives = [
         (index, primitive)
         for index, mesh in enumerate(document.get("meshes", []))
         for primitive in mesh["primitives"]
         if EXTENSION in primitive.get("extensions", {})
     ]
-    if len(found) != 1:
-        raise ValueError(f"it has {len(found)} primitives with {EXTENSION}, and one is read")
-    mesh, primitive = found[0]
+    if len(primitives) != 1:
+        raise ValueError(f"it has {len(primitives)} primitives with {EXTENSION}, and one is read")
+    mesh, primitive = primitives[0]
     _check(primitive)
     attributes = primitive["attributes"]
 

@@ -42,8 +42,8 @@ def scalar_codebook(values: Tensor, weights: Tensor, size: int = 256) -> Tensor:
     cells = torch.linspace(float(ordered[0]), float(ordered[-1]), 4096, dtype=torch.float64)
     dense = torch.diff(weight[torch.searchsorted(ordered, cells)]).clamp(min=0).pow(1 / 3) + 1e-12
     share = torch.cat([dense.new_zeros(1), dense.cumsum(0)]) / dense.sum()
-    wanted = (torch.arange(size, dtype=torch.float64) + 0.5) / size
-    book = cells[torch.searchsorted(share, wanted).clamp(max=cells.numel() - 1)]
+    quantiles = (torch.arange(size, dtype=torch.float64) + 0.5) / size
+    book = cells[torch.searchsorted(share, quantiles).clamp(max=cells.numel() - 1)]
     for _ in range(_SCALAR_PASSES):
         edges = torch.searchsorted(ordered, (book[1:] + book[:-1]) / 2)
         edges = torch.cat([edges.new_zeros(1), edges, edges.new_full((1,), ordered.numel())])
@@ -132,17 +132,17 @@ def _in_cells(rows: Tensor, weights: Tensor, size: int, generator: torch.Generat
     counts = torch.bincount(labels, minlength=cells)
     spread = torch.zeros(cells).index_add_(0, labels, errors * weights)
     shares = _shares(spread.double().numpy(), counts.numpy(), size)
-    found, first = [], 0
+    centroids, first = [], 0
     for count, share in zip(counts.tolist(), shares.tolist(), strict=True):
         of_cell = order[first : first + count]
         first += count
         if share == 0:
             continue
         if share >= count:
-            found.append(rows[of_cell])
+            centroids.append(rows[of_cell])
         else:
-            found.append(_lloyd(rows[of_cell], weights[of_cell], share, _LOCAL_PASSES, generator)[0])
-    return torch.cat(found)
+            centroids.append(_lloyd(rows[of_cell], weights[of_cell], share, _LOCAL_PASSES, generator)[0])
+    return torch.cat(centroids)
 
 
 def _shares(spread: Floats, counts: Integers, size: int) -> Integers:

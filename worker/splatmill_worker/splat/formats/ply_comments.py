@@ -44,10 +44,10 @@ def offset_of(path: Path, document: PlyData) -> Offset:
 
 def unknown_modes(document: PlyData) -> tuple[str, ...]:
     """A sentence for each render mode in the comments that is not known."""
-    found = [match[1] for comment in document.comments if (match := _MODE.match(comment))]
+    modes = [match[1] for comment in document.comments if (match := _MODE.match(comment))]
     return tuple(
         f"Its SplatRenderMode {mode[:40]!r} is not known, and says nothing of how it is drawn."
-        for mode in found
+        for mode in modes
         if mode.lower() not in _MODES
     )
 
@@ -56,8 +56,8 @@ def antialiased_of(document: PlyData) -> bool | None:
     """Whether the comments say that the model is drawn antialiased, by the last that does; None where none does."""
     said = None
     for comment in [*document.comments, *document.obj_info]:
-        if found := _MODE.match(comment):
-            said = _MODES.get(found[1].lower())
-        elif found := _FLAG.match(comment):
-            said = found[1] == "1"
+        if match := _MODE.match(comment):
+            said = _MODES.get(match[1].lower())
+        elif match := _FLAG.match(comment):
+            said = match[1] == "1"
     return said

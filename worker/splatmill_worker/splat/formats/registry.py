@@ -79,8 +79,8 @@ CODECS: dict[str, Codec] = {
 
 def reader(path: Path) -> Reader:
     """The function that reads a file, by its suffix. Raises ModelUnreadable for a suffix that is not read."""
-    found = format_of(path.name)
-    function = CODECS[found.suffix].read if found is not None else None
+    model_format = format_of(path.name)
+    function = CODECS[model_format.suffix].read if model_format is not None else None
     if function is None:
         known = ", ".join(suffix for suffix, of in MODEL_FORMATS.items() if of.readable)
         raise ModelUnreadable(f"{path.name} is of a format that is not read. Those that are: {known}.")
@@ -89,8 +89,8 @@ def reader(path: Path) -> Reader:
 
 def writer(path: Path) -> Writer:
     """The function that writes a file, by its suffix. Raises ModelUnreadable for a suffix that is not written."""
-    found = format_of(path.name)
-    function = CODECS[found.suffix].write if found is not None else None
+    model_format = format_of(path.name)
+    function = CODECS[model_format.suffix].write if model_format is not None else None
     if function is None:
         known = ", ".join(suffix for suffix, of in MODEL_FORMATS.items() if of.writable)
         raise ModelUnreadable(f"{path.name} is of a format that is not written. Those that are: {known}.")
@@ -111,8 +111,8 @@ def read(path: Path) -> Contents:
 
 def size(path: Path) -> int:
     """The bytes of a model that was written to `path`, those of the files beside it included."""
-    found = format_of(path.name)
-    files = None if found is None else CODECS[found.suffix].files
+    model_format = format_of(path.name)
+    files = None if model_format is None else CODECS[model_format.suffix].files
     parts = [path] if files is None else files(path)
     return sum(part.stat().st_size for part in parts)
 

@@ -197,8 +197,8 @@ def importance(gaussians: Gaussians) -> Tensor:
 
 def palette_size(count: int) -> int:
     """Centroids of the harmonics of `count` Gaussians: a multiple of CENTROIDS_PER_ROW within the bounds."""
-    wanted = min(max(count // GAUSSIANS_PER_CENTROID, LEAST_CENTROIDS), MOST_CENTROIDS)
-    return -(-wanted // CENTROIDS_PER_ROW) * CENTROIDS_PER_ROW
+    centroids = min(max(count // GAUSSIANS_PER_CENTROID, LEAST_CENTROIDS), MOST_CENTROIDS)
+    return -(-centroids // CENTROIDS_PER_ROW) * CENTROIDS_PER_ROW
 
 
 def _harmonics(rows: Tensor, weights: Tensor, size: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -367,9 +367,9 @@ def _names(meta: dict[str, Any]) -> dict[str, list[str]]:
         for part, images in _IMAGES.items()
         if part in meta or part != "shN"
     }
-    for part, found in names.items():
-        if len(found) < _IMAGES[part]:
-            raise ValueError(f"its {part} names {len(found)} of {_IMAGES[part]} images")
+    for part, files in names.items():
+        if len(files) < _IMAGES[part]:
+            raise ValueError(f"its {part} names {len(files)} of {_IMAGES[part]} images")
     every = [name for part in names.values() for name in part]
     twice = sorted({name for name in every if every.count(name) > 1})
     if twice:
@@ -397,9 +397,9 @@ def _check_side(name: str, count: int, other: tuple[int, int] | None, width: int
 
 
 def _check_palette(name: str, degree: int, width: int, height: int) -> None:
-    wanted = CENTROIDS_PER_ROW * REST_COEFFICIENTS[degree]
-    if width != wanted:
-        raise ValueError(f"its palette is {width} pixels wide, and degree {degree} needs {wanted}")
+    pixels = CENTROIDS_PER_ROW * REST_COEFFICIENTS[degree]
+    if width != pixels:
+        raise ValueError(f"its palette is {width} pixels wide, and degree {degree} needs {pixels}")
     if height > MAX_CENTROIDS // CENTROIDS_PER_ROW:
         raise ValueError(
             f"{name[:80]} has {height} rows of centroids, and labels reach {MAX_CENTROIDS // CENTROIDS_PER_ROW}"

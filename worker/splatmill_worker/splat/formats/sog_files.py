@@ -58,12 +58,12 @@ class Beside:
         self._path = path
 
     def size(self, name: str) -> int:
-        return self._found(name).stat().st_size
+        return self._file(name).stat().st_size
 
     def read(self, name: str) -> bytes:
-        return self._found(name).read_bytes()
+        return self._file(name).read_bytes()
 
-    def _found(self, name: str) -> Path:
+    def _file(self, name: str) -> Path:
         if PurePosixPath(name).name != name:
             raise ValueError(f"meta.json names a file outside of its folder: {name[:80]!r}")
         if name == "meta.json":

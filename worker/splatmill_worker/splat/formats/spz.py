@@ -248,8 +248,8 @@ def _floats(values: Bytes) -> Tensor:
 
 
 def _levels(values: Tensor) -> Bytes:
-    found: Bytes = values.round().clamp(0, 255).to(torch.uint8).numpy()
-    return found
+    levels: Bytes = values.round().clamp(0, 255).to(torch.uint8).numpy()
+    return levels
 
 
 def _positions(values: Bytes, bits: int) -> Tensor:

@@ -303,8 +303,8 @@ def finest(index: Any) -> list[str]:
     index: the document in a `lod-meta.json`. Raises ValueError, KeyError, TypeError, IndexError or AttributeError for
     another one.
     """
-    found = dict.fromkeys(node["lods"]["0"]["file"] for node in leaves(index) if "0" in node["lods"])
-    names = [*dict.fromkeys(index["filenames"][file] for file in found)]
+    numbers = dict.fromkeys(node["lods"]["0"]["file"] for node in leaves(index) if "0" in node["lods"])
+    names = [*dict.fromkeys(index["filenames"][file] for file in numbers)]
     names += [index["environment"]] if index.get("environment") else []
     if not names:
         raise ValueError("its tree has no leaf with level 0")

@@ -109,13 +109,13 @@ def write_levels(
 
 def files(path: Path) -> list[Path]:
     """The files of a tileset that `write` has written: `path`, and its tiles."""
-    found, tiles = [path], [json.loads(path.read_bytes())["root"]]
+    paths, tiles = [path], [json.loads(path.read_bytes())["root"]]
     while tiles:
         tile = tiles.pop()
         tiles += tile.get("children", [])
         if "content" in tile:
-            found.append(path.parent / tile["content"]["uri"])
-    return found
+            paths.append(path.parent / tile["content"]["uri"])
+    return paths
 
 
 @dataclass

@@ -190,12 +190,12 @@ def _batches(leaves: Sequence[Tensor]) -> list[list[Tensor]]:
     return batches
 
 
-def _reduced(moments: Moments, groups: Tensor, wanted: int) -> tuple[Moments, Tensor]:
-    """The moments merged in pairs, within groups, until at most `wanted` are left, and their groups."""
+def _reduced(moments: Moments, groups: Tensor, most: int) -> tuple[Moments, Tensor]:
+    """The moments merged in pairs, within groups, until at most `most` are left, and their groups."""
     for turn in range(_MOST_ROUNDS):
-        if moments.count <= wanted:
+        if moments.count <= most:
             break
-        first, second = pairs(moments, groups, moments.count - wanted, turn)
+        first, second = pairs(moments, groups, moments.count - most, turn)
         alone = torch.ones(moments.count, dtype=torch.bool)
         alone[first] = alone[second] = False
         groups = torch.cat([groups[alone], groups[first]])

@@ -42,14 +42,14 @@ def pairs(moments: Moments, groups: Tensor, most: int, turn: int) -> tuple[Tenso
     order = _order(moments.shapes.means, groups, _SHIFTS[turn % len(_SHIFTS)])
     costs = [*_costs(moments, groups, order)]
     free = torch.ones(moments.count, dtype=torch.bool)
-    found = []
+    batches = []
     for _ in range(PASSES):
         best, partner = _preferred(costs, free)
         first = (partner >= 0).nonzero()[:, 0]
         first = first[(partner[partner[first]] == first) & (first < partner[first])]
-        found.append((best[first], first, partner[first]))
+        batches.append((best[first], first, partner[first]))
         free[first] = free[partner[first]] = False
-    cost, first, second = (torch.cat(parts) for parts in zip(*found, strict=True))
+    cost, first, second = (torch.cat(parts) for parts in zip(*batches, strict=True))
     if len(cost) > most:
         cheapest = torch.argsort(cost, stable=True)[:most]
         first, second = first[cheapest], second[cheapest]

@@ -174,22 +174,22 @@ def _budget(
         because = f"The option steps asks for {options.steps} steps."
         return by_option(Budget(options.steps)), Decision(options.steps, because), None
     steps, gain = preset_steps(options.ending, facts.views), least_gain(facts, options)
-    given = f"No budget was given; for {facts.views} photos, the preset {options.ending.value} allows {steps} steps"
+    reason = f"No budget was given; for {facts.views} photos, the preset {options.ending.value} allows {steps} steps"
     takes = f"{steps} steps take about {format_duration(steps * step)} on this machine, at most"
     if not gain:
-        return Decision(Budget(steps), f"{given}."), Decision(steps, f"{takes}."), None
+        return Decision(Budget(steps), f"{reason}."), Decision(steps, f"{takes}."), None
     longest = PRESET_LONGEST * steps
-    given += f", and doubles them, up to {longest}, while the last doubling gained {gain:g} dB."
+    reason += f", and doubles them, up to {longest}, while the last doubling gained {gain:g} dB."
     takes += f", and {longest} steps {format_duration(longest * step)}."
-    return Decision(Budget(steps), given), Decision(steps, takes), longest
+    return Decision(Budget(steps), reason), Decision(steps, takes), longest
 
 
 def _time_budget(facts: Facts, options: TrainOptions, step: float) -> tuple[Decision[Budget], Decision[int]]:
-    seconds, given = training_seconds(facts, options, step)
+    seconds, limit = training_seconds(facts, options, step)
     affordable = max(1, int(seconds / step))
     steps = affordable if options.steps is None else min(affordable, options.steps)
     because = (
-        f"{given[0].upper()}{given[1:]} at {1e3 * step:.1f} ms a step allow about {affordable} steps"
+        f"{limit[0].upper()}{limit[1:]} at {1e3 * step:.1f} ms a step allow about {affordable} steps"
         + ("." if steps == affordable else f", of which the option steps asks for {steps}.")
     )
     few = PRESET_VISITS[Preset.draft]

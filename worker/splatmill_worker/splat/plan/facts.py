@@ -195,8 +195,8 @@ def measure(
     tell("comparing the light of the photos")
     sizes = np.array([[view.full.camera.width, view.full.camera.height] for view in views])
     width, height = (int(value) for value in np.median(sizes, axis=0))
-    seen = Observations.of(scene, views)
-    found = _coverage(scene, views, tell)
+    observations = Observations.of(scene, views)
+    survey = _coverage(scene, views, tell)
     facts = Facts(
         views=len(views),
         held_out=held_out,
@@ -210,11 +210,11 @@ def measure(
         distorted=sum(view.lens is not None for view in scene.views),
         faces=sum(view.face is not None for view in scene.views),
         halving_loss=float(np.median([halving_loss(view.full.rgb) for view in _some(views)])),
-        light=None if seen is None else compared(seen, views),
+        light=None if observations is None else compared(observations, views),
         geometry=None
-        if seen is None
-        else Geometry(seen.view_angle(_own_points(scene)), seen.distance_ratio()),
-        coverage=None if found is None else found[0],
+        if observations is None
+        else Geometry(observations.view_angle(_own_points(scene)), observations.distance_ratio()),
+        coverage=None if survey is None else survey[0],
         alignment=_alignment(views),
         reprojection=_reprojection(scene, max(width, height)),
         lens_residual=_lens_residual(scene, max(width, height)),
@@ -222,10 +222,10 @@ def measure(
         speed=speed,
         no_points=scene.facts.get("no_points"),
     )
-    del seen
+    del observations
     memory.return_freed()  # what was compared of many photos has left hundreds of megabytes of free pieces
     facts = replace(facts, memory_available=memory.available(), memory_used=memory.used() + LIBRARIES)
-    return facts, None if found is None else found[1]
+    return facts, None if survey is None else survey[1]
 
 
 def halving_loss(rgb: torch.Tensor) -> float:

@@ -53,11 +53,11 @@ def _needed(facts: Facts, kernels: Kernels, most: int) -> Decision[bool]:
         )
     if facts.coverage is None:
         return Decision(False, f"{facts.points} points are too few to tell what photos have in view.")
-    seen = f"A photo has {100 * facts.coverage.in_view:.0f} % of the points in its view (median)"
+    share = f"A photo has {100 * facts.coverage.in_view:.0f} % of the points in its view (median)"
     if facts.coverage.in_view > MOST_IN_VIEW:
-        return Decision(False, f"{seen}; steps leave out the rest where it is half of them at least.")
+        return Decision(False, f"{share}; steps leave out the rest where it is half of them at least.")
     if most < MANY_GAUSSIANS:
-        return Decision(False, f"{seen}, but {most} Gaussians are too few for steps to leave some out.")
+        return Decision(False, f"{share}, but {most} Gaussians are too few for steps to leave some out.")
     return Decision(
-        True, f"{seen}, so steps leave out Gaussians that are not, in clusters of 256, and catch up later."
+        True, f"{share}, so steps leave out Gaussians that are not, in clusters of 256, and catch up later."
     )

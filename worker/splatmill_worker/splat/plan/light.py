@@ -91,7 +91,7 @@ class Light:
         return known
 
 
-def compared(seen: Observations, views: Sequence[TrainingView]) -> Light | None:
+def compared(observations: Observations, views: Sequence[TrainingView]) -> Light | None:
     """The light of the photos `views` from their observations; None where too few photos have enough of them.
 
     The logarithm of each value is modelled as the sum of a term of its point and a term of its photo. Adding a constant
@@ -107,11 +107,11 @@ def compared(seen: Observations, views: Sequence[TrainingView]) -> Light | None:
     whose reach and noise are those of the least mean error (Rasmussen and Williams 2006, section 5.4.2). The constant
     alone predicts where that is not clearly worse.
     """
-    exposures, errors = _exposures(seen)
+    exposures, errors = _exposures(observations)
     known = np.isfinite(errors)
     if known.sum() < ENOUGH_PHOTOS:
         return None
-    cameras = [view.full.camera for view, wanted in zip(views, known, strict=True) if wanted]
+    cameras = [view.full.camera for view, finite in zip(views, known, strict=True) if finite]
     places = np.array([camera.center for camera in cameras])
     places -= places.mean(axis=0)
     places /= max(float(np.linalg.norm(places, axis=1).max()), 1e-12)
@@ -122,29 +122,33 @@ def compared(seen: Observations, views: Sequence[TrainingView]) -> Light | None:
     return Light(exposures, departures, errors, _unseen(apart))
 
 
-def _exposures(seen: Observations) -> tuple[Float, Float]:
+def _exposures(observations: Observations) -> tuple[Float, Float]:
     """Exposures [n, 3] and their standard errors [n] by reweighted least squares, solved in alternation.
 
     Weights fall with the residual, so that outliers (highlights, occlusions) have little influence.
     """
-    exposures = np.zeros((seen.photos, 3))
-    errors = np.zeros(seen.photos)
+    exposures = np.zeros((observations.photos, 3))
+    errors = np.zeros(observations.photos)
     for channel in range(3):
-        values = seen.color[:, channel].astype(np.float64)
+        values = observations.color[:, channel].astype(np.float64)
         told = ((values >= DARKEST) & (values <= BRIGHTEST)).astype(np.float64)
         log = np.log(np.maximum(values, 1.0))
-        of_photo, residual, weight = np.zeros(seen.photos), log, told
-        enough = np.bincount(seen.photo, told, minlength=seen.photos) >= ENOUGH_OF_A_PHOTO
+        of_photo, residual, weight = np.zeros(observations.photos), log, told
+        enough = np.bincount(observations.photo, told, minlength=observations.photos) >= ENOUGH_OF_A_PHOTO
         for _ in range(ITERATIONS):
-            of_point = _group_mean(log - of_photo[seen.photo], weight, seen.point, seen.points)
-            of_photo = _group_mean(log - of_point[seen.point], weight, seen.photo, seen.photos)
+            of_point = _group_mean(
+                log - of_photo[observations.photo], weight, observations.point, observations.points
+            )
+            of_photo = _group_mean(
+                log - of_point[observations.point], weight, observations.photo, observations.photos
+            )
             of_photo = np.where(enough, of_photo - of_photo[enough].mean() if enough.any() else 0.0, 0.0)
-            residual = log - of_point[seen.point] - of_photo[seen.photo]
+            residual = log - of_point[observations.point] - of_photo[observations.photo]
             weight = told / np.maximum(np.abs(residual), RESIDUAL_FLOOR)
         exposures[:, channel] = of_photo
         # The mean absolute deviation of a normal distribution is 0.8 of its standard deviation.
-        deviation = _group_mean(np.abs(residual), told, seen.photo, seen.photos) / 0.8
-        count = np.bincount(seen.photo, told, minlength=seen.photos)
+        deviation = _group_mean(np.abs(residual), told, observations.photo, observations.photos) / 0.8
+        count = np.bincount(observations.photo, told, minlength=observations.photos)
         errors = np.maximum(errors, np.where(enough, deviation / np.sqrt(np.maximum(count, 1.0)), np.inf))
     exposures[~np.isfinite(errors)] = 0.0
     return exposures, errors
@@ -159,12 +163,12 @@ def _unpredicted(exposures: Float, apart: Float) -> Float:
     brightness = exposures.mean(axis=1)
     kernels = [(np.zeros((count, count)), 1.0)]  # a constant alone
     kernels += [(np.exp(-0.5 * apart / reach**2), share) for reach in REACHES for share in SHARES]
-    found: list[tuple[Float, Float]] = []
+    fits: list[tuple[Float, Float]] = []
     for kernel, share in kernels:
         inverse = _precision(kernel, share)
         left = inverse / np.diag(inverse)[:, None]  # times the values: the error of each from all others
-        found.append((np.abs(left @ brightness), left @ exposures))
-    (plain, by_constant), (least, rest) = found[0], min(found, key=lambda each: float(each[0].mean()))
+        fits.append((np.abs(left @ brightness), left @ exposures))
+    (plain, by_constant), (least, rest) = fits[0], min(fits, key=lambda each: float(each[0].mean()))
     gain = plain - least
     if not gain.mean() > CLEAR * gain.std() / np.sqrt(count):
         rest = by_constant

@@ -112,17 +112,17 @@ def _far_shell(facts: Facts) -> Decision[bool]:
         )
     if facts.coverage is None:
         return Decision(False, "There are too few points to tell how far the scene extends.")
-    seen = f"{100 * facts.coverage.sky_share:.0f} % of the photos look like sky"
+    sky = f"{100 * facts.coverage.sky_share:.0f} % of the photos look like sky"
     to_one_side = facts.alignment is None or facts.alignment > HALF_TURN
     if facts.views < FEW_VIEWS and facts.coverage.sky_share < MUCH_SKY and to_one_side:
         return Decision(
             False,
-            f"{seen}, and {facts.views} photos to one side are too few to tell whether anything else is as far away.",
+            f"{sky}, and {facts.views} photos to one side are too few to tell whether anything else is as far away.",
         )
     return Decision(
         True,
         f"{facts.coverage.shell_points} Gaussians stand on a far shell behind the scene, for what shows through its "
-        f"holes and for sky; {seen}.",
+        f"holes and for sky; {sky}.",
     )
 
 
@@ -137,23 +137,23 @@ def _gaps(facts: Facts) -> Decision[bool]:
             )
         return Decision(False, "There are too few points to tell where points are missing.")
     covered = facts.coverage
-    seen = (
+    gap = (
         f"{100 * covered.gap_share:.0f} % of what the photos show has no point near it "
         f"(median of {covered.sightings:.0f} points per photo)"
     )
     if covered.gap_share < MANY_GAPS:
-        return Decision(False, f"Only {seen}.")
+        return Decision(False, f"Only {gap}.")
     if facts.views < FEW_VIEWS:
-        return Decision(False, f"{seen}, but {facts.views} photos are too few to correct guessed depths.")
+        return Decision(False, f"{gap}, but {facts.views} photos are too few to correct guessed depths.")
     if facts.alignment is not None and facts.alignment <= HALF_TURN:
         return Decision(
             False,
-            f"{seen}, but the photos look over more than half a turn, so that those of one side would look through "
+            f"{gap}, but the photos look over more than half a turn, so that those of one side would look through "
             "what is guessed from the other.",
         )
     return Decision(
         True,
-        f"{seen}: {covered.gap_points} Gaussians are added there, at the depth of the nearest points.",
+        f"{gap}: {covered.gap_points} Gaussians are added there, at the depth of the nearest points.",
     )
 
 
@@ -163,15 +163,16 @@ def _poses(facts: Facts, kernels: Kernels, scale: float) -> Decision[bool]:
     error = scale * facts.reprojection
     if facts.views < 2:
         return Decision(False, "A model of one photo fits any camera.")
-    seen = f"The median reprojection error is {error:.2f} pixels"
+    reprojection = f"The median reprojection error is {error:.2f} pixels"
     if facts.faces:
         return Decision(
-            False, f"{seen}, but the faces of a photo share a camera, and would be corrected apart."
+            False, f"{reprojection}, but the faces of a photo share a camera, and would be corrected apart."
         )
     if error < MIN_POSE_ERROR:
-        return Decision(False, f"{seen}; cameras are corrected from {MIN_POSE_ERROR:g} pixel.")
+        return Decision(False, f"{reprojection}; cameras are corrected from {MIN_POSE_ERROR:g} pixel.")
     if kernels == "gpu":
         return Decision(
-            False, f"{seen}, which calls for correcting the cameras, but the gpu kernels cannot do so."
+            False,
+            f"{reprojection}, which calls for correcting the cameras, but the gpu kernels cannot do so.",
         )
-    return Decision(True, f"{seen}, so the cameras of training photos are corrected.")
+    return Decision(True, f"{reprojection}, so the cameras of training photos are corrected.")

@@ -58,9 +58,12 @@ class Observations:
         for i, view in enumerate(views):
             rows = point[photo == i]
             camera, rgb = view.full.camera, view.full.rgb.numpy()
-            seen = camera.project(scene.points[rows])
-            rows, z = rows[seen.inside], seen.depths[seen.inside]
-            color = rgb[seen.rows[seen.inside].astype(np.int64), seen.columns[seen.inside].astype(np.int64)]
+            projection = camera.project(scene.points[rows])
+            rows, z = rows[projection.inside], projection.depths[projection.inside]
+            color = rgb[
+                projection.rows[projection.inside].astype(np.int64),
+                projection.columns[projection.inside].astype(np.int64),
+            ]
             away = scene.points[rows] - camera.center
             direction = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
             columns.append((rows, np.full(len(rows), i), color, z / camera.fx, direction))

@@ -175,20 +175,20 @@ def _exposure(facts: Facts) -> Decision[bool]:
             "The photos' exposures cannot be compared: it is not known which photos show the same points.",
         )
     tail, error = facts.light.tail, facts.light.error
-    seen = f"One photo in ten departs by {100 * tail:.1f} % or more from the light of the photos around it"
+    light = f"One photo in ten departs by {100 * tail:.1f} % or more from the light of the photos around it"
     if not tail >= LIGHT_DEPARTS:
-        return Decision(False, f"{seen}; exposures are corrected from {100 * LIGHT_DEPARTS:.1f} %.")
+        return Decision(False, f"{light}; exposures are corrected from {100 * LIGHT_DEPARTS:.1f} %.")
     if not tail >= CERTAIN * error:
         return Decision(
-            False, f"{seen}, which an error of {100 * error:.1f} % of their exposures may explain."
+            False, f"{light}, which an error of {100 * error:.1f} % of their exposures may explain."
         )
     if facts.light.unseen > LIGHT_UNSEEN:
         return Decision(
             False,
-            f"{seen}, but the photos are too far apart to tell a change of exposure from light that changes with the "
+            f"{light}, but the photos are too far apart to tell a change of exposure from light that changes with the "
             "direction of view.",
         )
-    return Decision(True, f"{seen}, so exposure and white balance of the training photos are corrected.")
+    return Decision(True, f"{light}, so exposure and white balance of the training photos are corrected.")
 
 
 def decide_antialias(facts: Facts, options: TrainOptions) -> Decision[bool]:

@@ -137,14 +137,14 @@ def _views(rows: Sequence[dict[str, Any]]) -> str:
     return _table(["photo", "split", *(head for _, head, _ in shown)], lines, 2)
 
 
-def _disagreeing(found: Disagreeing) -> list[str]:
-    if not found.named:
+def _disagreeing(photos: Disagreeing) -> list[str]:
+    if not photos.named:
         return ["<p>None does.</p>"]
     rows = [
-        [each.name, each.reason, f"{each.decibels:.1f}", f"{100 * each.share:.1f}"] for each in found.named
+        [each.name, each.reason, f"{each.decibels:.1f}", f"{100 * each.share:.1f}"] for each in photos.named
     ]
     lines = [_table(["photo", "looks like", "worse by (dB)", "of its pixels (%)"], rows, 2)]
-    return [*lines, *_marked(found.marked)]
+    return [*lines, *_marked(photos.marked)]
 
 
 def _marked(photos: Sequence[MarkedPhoto]) -> list[str]:

@@ -62,8 +62,8 @@ class Cells:
             mean = area(rgb * counted) / np.maximum(share, np.float32(1e-6))
             used = share[0] > 0.5
         color = (mean + 0.5).astype(np.uint8).transpose(1, 2, 0)
-        seen = projected(camera, points)
-        return Cells(camera, color, cells_near(seen, (height, width), spread=1), used, seen)
+        places = projected(camera, points)
+        return Cells(camera, color, cells_near(places, (height, width), spread=1), used, places)
 
     def unproject(self, cells: Index, depth: Float) -> Float:
         """Points [k, 3] in the world at the centres of `cells` [k, 2] (row, column) and camera depths `depth` [k]."""
@@ -90,16 +90,18 @@ def visible_points(scene: Scene, views: Sequence[TrainingView]) -> list[Float]:
 
 def projected(camera: Camera, points: Float) -> Float:
     """Column, row and depth [k, 3] of those `points` [n, 3] that fall into the picture of `camera`."""
-    seen = camera.project(points)
-    inside: Float = np.stack([seen.columns, seen.rows, seen.depths], axis=1)[seen.inside]
+    projection = camera.project(points)
+    inside: Float = np.stack([projection.columns, projection.rows, projection.depths], axis=1)[
+        projection.inside
+    ]
     return inside
 
 
-def cells_near(seen: Float, shape: tuple[int, int], *, spread: int) -> Flags:
-    """bool [h, w]: cells that hold a point of `seen` (column, row, ...), or have one at most `spread` cells away."""
+def cells_near(places: Float, shape: tuple[int, int], *, spread: int) -> Flags:
+    """bool [h, w]: cells that hold a point of `places` (column, row, ...), or have one at most `spread` cells away."""
     height, width = shape
     marks = np.zeros((height + 2 * spread, width + 2 * spread), bool)
-    column, row = seen[:, 0].astype(np.int64), seen[:, 1].astype(np.int64)
+    column, row = places[:, 0].astype(np.int64), places[:, 1].astype(np.int64)
     for down in range(2 * spread + 1):
         for right in range(2 * spread + 1):
             marks[row + down, column + right] = True

@@ -63,17 +63,17 @@ def _scored(targets: Sequence[Target], points: Float) -> tuple[Float, Pixels]:
     The score is the number of photos that show something at the point, less SEEN_THROUGH times the number of those that
     are transparent there: one photo that sees through a point outweighs several that show something near it.
     """
-    seen, missed = np.zeros(len(points)), np.zeros(len(points))
+    hits, missed = np.zeros(len(points)), np.zeros(len(points))
     color = np.zeros((len(points), 3))
     for target in targets:
         inside, rows, columns = _pixels(target.camera, points)
         cover = np.ones(len(rows)) if target.alpha is None else target.alpha.numpy()[rows, columns] / 255.0
-        seen[inside] += cover
+        hits[inside] += cover
         missed[inside] += 1.0 - cover
         color[inside] += cover[:, None] * target.rgb.numpy()[rows, columns]
-    mean = color / np.maximum(seen, 1e-9)[:, None]
-    mean[seen <= 0] = 128.0
-    return seen - SEEN_THROUGH * missed, mean.clip(0, 255).astype(np.uint8)
+    mean = color / np.maximum(hits, 1e-9)[:, None]
+    mean[hits <= 0] = 128.0
+    return hits - SEEN_THROUGH * missed, mean.clip(0, 255).astype(np.uint8)
 
 
 def median_distance(centers: Float, target: Float) -> float:
@@ -97,6 +97,6 @@ def _along_rays(cameras: Sequence[Camera], distance: float, count: int, random: 
 
 def _pixels(camera: Camera, points: Float) -> tuple[Index, Index, Index]:
     """Indices of the points that fall on the photo, with the row and the column that they fall on."""
-    seen = camera.project(points)
-    inside = np.flatnonzero(seen.inside)
-    return inside, seen.rows[inside].astype(np.int64), seen.columns[inside].astype(np.int64)
+    projection = camera.project(points)
+    inside = np.flatnonzero(projection.inside)
+    return inside, projection.rows[inside].astype(np.int64), projection.columns[inside].astype(np.int64)

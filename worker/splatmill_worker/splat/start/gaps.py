@@ -36,13 +36,13 @@ def gap_points(cells: Sequence[Cells]) -> tuple[Float, Pixels]:
         if not len(rows) or len(grid.points) < NEIGHBOURS:
             continue
         depth = _depths(_one_per_cell(grid.points), rows)
-        wanted = np.full(grid.covered.shape, np.inf)
-        wanted[rows[:, 0], rows[:, 1]] = depth
-        seen = projected(grid.camera, earlier.near(grid.camera))
+        depths = np.full(grid.covered.shape, np.inf)
+        depths[rows[:, 0], rows[:, 1]] = depth
+        places = projected(grid.camera, earlier.near(grid.camera))
         # Infinite where no depth is wanted, so that no earlier point agrees there.
-        expected = wanted[seen[:, 1].astype(np.int64), seen[:, 0].astype(np.int64)]
-        agree = (seen[:, 2] < MAX_DEPTH_RATIO * expected) & (seen[:, 2] > expected / MAX_DEPTH_RATIO)
-        taken = cells_near(seen[agree], grid.color.shape[:2], spread=0)
+        expected = depths[places[:, 1].astype(np.int64), places[:, 0].astype(np.int64)]
+        agree = (places[:, 2] < MAX_DEPTH_RATIO * expected) & (places[:, 2] > expected / MAX_DEPTH_RATIO)
+        taken = cells_near(places[agree], grid.color.shape[:2], spread=0)
         free = ~taken[rows[:, 0], rows[:, 1]]
         points.append(grid.unproject(rows[free], depth[free]))
         earlier.add(points[-1])

@@ -93,7 +93,7 @@ def read_given_model(path: Path, normalization: Normalization, most: int) -> Sta
     Raises StartUnusable where the file cannot be read or holds no Gaussian.
     """
     try:
-        start, offset = decoders.call_once(given_file.read, path, most, check=_given, fault=_fault)
+        start, offset = decoders.call_once(given_file.read, path, most, check=_start, fault=_fault)
     except ModelUnreadable as error:
         raise StartUnusable(error.message) from error
     except OSError as error:
@@ -104,7 +104,7 @@ def read_given_model(path: Path, normalization: Normalization, most: int) -> Sta
     return replace(start, gaussians=start.gaussians.moved(normalization.scale, torch.from_numpy(shift)))
 
 
-def _given(answer: Any) -> tuple[Start, list[float]]:
+def _start(answer: Any) -> tuple[Start, list[float]]:
     """What `given_file.read` returns as a `Start`, in the coordinates of the file, and its offset.
 
     Raises ValueError and KeyError.

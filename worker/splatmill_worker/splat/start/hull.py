@@ -343,11 +343,11 @@ def _colors(targets: Sequence[Target], points: Float, size: float) -> Pixels:
     for target in targets:
         assert target.alpha is not None
         camera = target.camera
-        seen = camera.project(points)
-        rows = np.flatnonzero(seen.inside)
+        projection = camera.project(points)
+        rows = np.flatnonzero(projection.inside)
         if not len(rows):
             continue
-        row, column, depth = seen.rows[rows], seen.columns[rows], seen.depths[rows]
+        row, column, depth = projection.rows[rows], projection.columns[rows], projection.depths[rows]
         # Twice as many pixels as a voxel covers, so that the surface has no holes.
         cell = max(1.0, 2.0 * size * camera.fx / float(np.median(depth)))
         across, down = int(camera.width / cell) + 1, int(camera.height / cell) + 1

@@ -56,16 +56,16 @@ def add_seeds(
     if not (fill_gaps or add_far_shell):
         return gaussians
     cells = cells_of(scene, views) if seeds is None else []
-    found: list[tuple[Float, Pixels, float]] = []
+    additions: list[tuple[Float, Pixels, float]] = []
     if add_far_shell:
         shell = far_shell.shell_points(cells, scene.points) if seeds is None else seeds.shell
-        found.append((*shell, far_shell.OPACITY))
+        additions.append((*shell, far_shell.OPACITY))
     if fill_gaps:
         tell("filling gaps between the points")
-        found.append((*(gaps.gap_points(cells) if seeds is None else seeds.gaps), INITIAL_OPACITY))
+        additions.append((*(gaps.gap_points(cells) if seeds is None else seeds.gaps), INITIAL_OPACITY))
     parts = [gaussians]
     room = max(0, max_gaussians - gaussians.count)
-    for points, colors, opacity in found:
+    for points, colors, opacity in additions:
         points, colors = _at_most(room, points, colors)
         room -= len(points)
         if len(points) > 1:

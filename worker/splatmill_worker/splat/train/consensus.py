@@ -179,14 +179,14 @@ def neighbours(targets: Sequence[Target]) -> list[list[int]]:
     return [row.argsort(stable=True)[:count].tolist() for row in apart]
 
 
-def _compared(seen: Glance, photos: _All, others: Sequence[int], floor: float) -> Comparison:
-    expected = _expected(seen, photos, others).reshape_as(seen.residual)
-    known = torch.isfinite(expected) & seen.counted
+def _compared(photo: Glance, photos: _All, others: Sequence[int], floor: float) -> Comparison:
+    expected = _expected(photo, photos, others).reshape_as(photo.residual)
+    known = torch.isfinite(expected) & photo.counted
     scale = torch.where(known, expected, expected.new_zeros(())).clamp_min(floor)
-    ratio = seen.residual / scale
+    ratio = photo.residual / scale
     weak = known & (ratio > GROWN)
     seeds = (_box((known & (ratio > SEED)).float()) >= COHERENT) & weak
-    worse = float((seen.residual[known] / scale[known]).square().mean()) if bool(known.any()) else 1.0
+    worse = float((photo.residual[known] / scale[known]).square().mean()) if bool(known.any()) else 1.0
     return Comparison(
         median=float(ratio[known].median()) if bool(known.any()) else 0.0,
         ratio=torch.where(known, ratio, ratio.new_tensor(math.nan)),
@@ -195,12 +195,12 @@ def _compared(seen: Glance, photos: _All, others: Sequence[int], floor: float) -
     )
 
 
-def _expected(seen: Glance, photos: _All, others: Sequence[int]) -> Tensor:
+def _expected(photo: Glance, photos: _All, others: Sequence[int]) -> Tensor:
     """Median residual [h w] of the photos `others` at the places that a photo shows; NaN where too few show them."""
     index = torch.tensor(others)
     viewmat, K = photos.viewmat[index], photos.K[index]
     width, height = photos.width[index, None], photos.height[index, None]
-    local = _places(seen) @ viewmat[:, :3, :3].transpose(1, 2) + viewmat[:, None, :3, 3]
+    local = _places(photo) @ viewmat[:, :3, :3].transpose(1, 2) + viewmat[:, None, :3, 3]
     z = local[..., 2]
     safe = z.clamp_min(1e-6)
     column = (local[..., 0] / safe * K[:, 0, 0, None] + K[:, 0, 2, None]).floor()
@@ -211,17 +211,17 @@ def _expected(seen: Glance, photos: _All, others: Sequence[int]) -> Tensor:
     same = (photos.depth[at] - z).abs() <= SAME_DEPTH * z
     valid = inside & same & photos.counted[at]
     residual = torch.where(valid, photos.residual[at], z.new_tensor(math.nan))
-    enough = (valid.sum(dim=0) >= ENOUGH) & (seen.depth.reshape(-1) > 0)
+    enough = (valid.sum(dim=0) >= ENOUGH) & (photo.depth.reshape(-1) > 0)
     return torch.where(enough, residual.nanmedian(dim=0).values, z.new_tensor(math.nan))
 
 
-def _places(seen: Glance) -> Tensor:
+def _places(photo: Glance) -> Tensor:
     """World positions [h w, 3] of what each pixel shows."""
-    height, width = seen.depth.shape
-    K, viewmat = seen.target.K, seen.target.viewmat
+    height, width = photo.depth.shape
+    K, viewmat = photo.target.K, photo.target.viewmat
     rows, columns = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     x, y = (columns - K[0, 2]) / K[0, 0], (rows - K[1, 2]) / K[1, 1]
-    local = (torch.stack([x, y, torch.ones_like(x)], dim=2) * seen.depth[..., None]).reshape(-1, 3)
+    local = (torch.stack([x, y, torch.ones_like(x)], dim=2) * photo.depth[..., None]).reshape(-1, 3)
     return (local - viewmat[:3, 3]) @ viewmat[:3, :3]
 
 

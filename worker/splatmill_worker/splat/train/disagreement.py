@@ -70,26 +70,26 @@ class Look:
     def __init__(self, run: TrainingRun) -> None:
         self._run = run
         self._compared = [index for index in range(len(run.views)) if index not in run.set_aside]
-        self._found: tuple[Disagreement, ...] | None = None
+        self._disagreements: tuple[Disagreement, ...] | None = None
         self.seconds = 0.0
 
     def is_due(self, run: TrainingRun) -> bool:
         """Whether to compare them now. A run that continues from a checkpoint compares them again."""
-        return self._found is None and (
+        return self._disagreements is None and (
             run.state.step >= VISITS * len(self._compared) or run.progress >= LATEST
         )
 
     def observe(self, run: TrainingRun) -> None:
         """Compare the photos with what the run's engine holds."""
         started = time.perf_counter()
-        self._found = disagreements(run, self._compared)
+        self._disagreements = disagreements(run, self._compared)
         self.seconds = time.perf_counter() - started
 
     def finish(self) -> tuple[Disagreement, ...]:
         """What was found; of the end of the run where it ended before the photos were compared."""
-        if self._found is None:
+        if self._disagreements is None:
             self.observe(self._run)
-        return self._found or ()
+        return self._disagreements or ()
 
 
 def disagreements(run: TrainingRun, learnt: Sequence[int]) -> tuple[Disagreement, ...]:
@@ -106,23 +106,23 @@ def disagreements(run: TrainingRun, learnt: Sequence[int]) -> tuple[Disagreement
         moved = [run.poses.viewmat(index) for index in learnt]
         targets = [target._replace(viewmat=viewmat) for target, viewmat in zip(targets, moved, strict=True)]
     glances = [glance(run.engine, run.plan, target, background) for target in targets]
-    found = compared(glances)
-    usual = sorted(comparison.median for comparison in found)[len(found) // 2]
+    comparisons = compared(glances)
+    usual = sorted(comparison.median for comparison in comparisons)[len(comparisons) // 2]
     cut_out = [view.full.alpha is not None and int(view.full.alpha.min()) < SOLID for view in views]
     judged = [
-        _judged(view.name, seen, comparison, usual, whole=not cut and 2 * sum(cut_out) > len(views))
-        for view, seen, comparison, cut in zip(views, glances, found, cut_out, strict=True)
+        _judged(view.name, photo, comparison, usual, whole=not cut and 2 * sum(cut_out) > len(views))
+        for view, photo, comparison, cut in zip(views, glances, comparisons, cut_out, strict=True)
     ]
     return tuple(sorted(judged, key=lambda each: -each.decibels))
 
 
-def _judged(name: str, seen: Glance, comparison: Comparison, usual: float, *, whole: bool) -> Disagreement:
+def _judged(name: str, photo: Glance, comparison: Comparison, usual: float, *, whole: bool) -> Disagreement:
     """whole: whether the photo is opaque, and most of the others are cut out: their light is not what differs."""
     share = float(comparison.outliers.float().mean())
     reason: Reason | None = None
-    if whole and (seen.light >= OTHER_LIGHT or comparison.decibels > 0.0):
+    if whole and (photo.light >= OTHER_LIGHT or comparison.decibels > 0.0):
         reason = "not cut out"
-    elif seen.light >= OTHER_LIGHT:
+    elif photo.light >= OTHER_LIGHT:
         reason = "other light"
     elif comparison.decibels <= 0.0:
         reason = None

@@ -60,8 +60,8 @@ class LossHealth:
             raise TrainingFailed(FailureName.non_finite, f"the loss became {loss}.", step=step)
         self.empty_steps = self.empty_steps + 1 if visible == 0 else 0
         if self.empty_steps >= EMPTY_STEPS:
-            seen = f"none of the last {EMPTY_STEPS} photos showed any Gaussian."
-            raise TrainingFailed(FailureName.empty_scene, seen, step=step)
+            symptom = f"none of the last {EMPTY_STEPS} photos showed any Gaussian."
+            raise TrainingFailed(FailureName.empty_scene, symptom, step=step)
         self.smoothed = (
             loss if self.smoothed is None else SMOOTHING * self.smoothed + (1.0 - SMOOTHING) * loss
         )
@@ -71,8 +71,8 @@ class LossHealth:
         if (
             not self.smoothed <= DIVERGENCE_RATIO * self.lowest + DIVERGENCE_MARGIN
         ):  # written so that NaN fails
-            seen = f"the loss rose from {self.lowest:.3f} to {self.smoothed:.3f}."
-            raise TrainingFailed(FailureName.divergence, seen, step=step)
+            symptom = f"the loss rose from {self.lowest:.3f} to {self.smoothed:.3f}."
+            raise TrainingFailed(FailureName.divergence, symptom, step=step)
 
 
 def not_finite(values: Tensor) -> int:

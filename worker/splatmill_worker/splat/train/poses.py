@@ -36,19 +36,19 @@ class Poses:
     cameras together that amount to moving, turning and scaling the world) are projected out after every step, so that
     the scene stays where the held-out cameras, which are not refined, look at it.
 
-    given: float64 [n, 4, 4], the viewmats as the views came with them.
+    viewmats: float64 [n, 4, 4], the viewmats as the views came with them.
     depth: typical distance from a camera to the scene, world units.
     twists: float64 [n, 6].
     """
 
     def __init__(self, views: Sequence[TrainingView], depth: float) -> None:
         """depth: typical distance from a camera to the scene, which says how many pixels a translation is worth."""
-        self.given = torch.stack([torch.from_numpy(view.full.camera.viewmat) for view in views])
+        self.viewmats = torch.stack([torch.from_numpy(view.full.camera.viewmat) for view in views])
         focal = torch.tensor([view.full.camera.fx for view in views], dtype=torch.float64)
         self.depth = depth
         # Each component of a twist that moves the image by one pixel.
         self._pixel = torch.cat([torch.full((3,), depth), torch.ones(3)]).double() / focal.median()
-        self._gauge = gauge(self.given)
+        self._gauge = gauge(self.viewmats)
         self._onto_gauge = torch.linalg.pinv(self._gauge / self._pixel.repeat(len(views))[:, None])
         self.twists = torch.zeros(len(views), 6, dtype=torch.float64)
         self._exp_avg = torch.zeros_like(self.twists)
@@ -62,7 +62,7 @@ class Poses:
 
     def viewmat_double(self, index: int) -> Tensor:
         """The refined viewmat of camera `index`, float64 [4, 4]."""
-        return motion(self.twists[index]) @ self.given[index]
+        return motion(self.twists[index]) @ self.viewmats[index]
 
     def update(self, index: int, gradient: Tensor, progress: float, scale: float) -> None:
         """Take one Adam step of camera `index` along `gradient` [6], the derivative of the loss by its twist.

@@ -311,5 +311,5 @@ class TrainingRun:
         except MemoryError as short:
             raise TrainingFailed(FailureName.memory, f"{short}", step=self.state.step) from short
         if self.engine.count == 0:
-            seen = "every Gaussian became transparent and was removed."
-            raise TrainingFailed(FailureName.empty_scene, seen, step=self.state.step)
+            symptom = "every Gaussian became transparent and was removed."
+            raise TrainingFailed(FailureName.empty_scene, symptom, step=self.state.step)

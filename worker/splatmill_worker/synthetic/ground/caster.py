@@ -29,7 +29,7 @@ Place = tuple[slice, slice]
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _PlacedSolid:
     """A solid that may be in view, with the rays that may meet it and those whose points it may shade.
 
     looks, textures: of its faces, as `solids.looks` returns them.
@@ -50,10 +50,10 @@ def photograph(town: Town, camera: Camera, samples: int = 2) -> npt.NDArray[np.u
     sees the horizon.
     """
     rays = Rays.of(camera, samples)
-    seen = list(_seen(town, camera, rays))
-    inverse, face = _cast(rays, seen)
-    light = _light(rays, seen, 1.0 / inverse)
-    faces = _Faces.of(seen)
+    solids = list(_solids(town, camera, rays))
+    inverse, face = _cast(rays, solids)
+    light = _light(rays, solids, 1.0 / inverse)
+    faces = _Faces.of(solids)
     whole, parts = (
         _Samples.of(camera, rays, samples, inverse, face, light, uniform) for uniform in (True, False)
     )
@@ -68,16 +68,16 @@ def photograph(town: Town, camera: Camera, samples: int = 2) -> npt.NDArray[np.u
 def depths(town: Town, camera: Camera) -> npt.NDArray[np.float32]:
     """Depth at pixel centres, float32 [H, W], in metres. Raises ValueError as `photograph`."""
     rays = Rays.of(camera, 1)
-    inverse, _ = _cast(rays, list(_seen(town, camera, rays)))
-    found: npt.NDArray[np.float32] = (1.0 / inverse).numpy()
-    return found
+    inverse, _ = _cast(rays, list(_solids(town, camera, rays)))
+    depth: npt.NDArray[np.float32] = (1.0 / inverse).numpy()
+    return depth
 
 
-def _cast(rays: Rays, seen: list[_Seen]) -> tuple[Tensor, Tensor]:
+def _cast(rays: Rays, solids: list[_PlacedSolid]) -> tuple[Tensor, Tensor]:
     """Inverse depth, and which face of which solid the rays meet: FACES times its number + the face, or -1 [H, W]."""
     inverse = _on_ground(rays)
     face = torch.full(inverse.shape, -1, dtype=torch.int32)
-    for number, each in enumerate(seen):
+    for number, each in enumerate(solids):
         if each.place is None:
             continue
         entry, plane = each.solid.hit(rays.part(*each.place))
@@ -97,7 +97,7 @@ def _on_ground(rays: Rays) -> Tensor:
     return inverse
 
 
-def _seen(town: Town, camera: Camera, rays: Rays) -> Iterator[_Seen]:
+def _solids(town: Town, camera: Camera, rays: Rays) -> Iterator[_PlacedSolid]:
     """The solids that a photo shows or whose shadows it may show."""
     for east, north in _blocks(camera):
         block = town.block(east, north)
@@ -113,7 +113,7 @@ def _seen(town: Town, camera: Camera, rays: Rays) -> Iterator[_Seen]:
             block.solids, *ahead, block.looks, block.textures, strict=True
         ):
             if shadow is not None:
-                yield _Seen(solid, place, shadow, look, number)
+                yield _PlacedSolid(solid, place, shadow, look, number)
 
 
 def _blocks(camera: Camera) -> list[tuple[int, int]]:
@@ -144,9 +144,9 @@ def _places(camera: Camera, rays: Rays, corners: Float) -> list[Place | None]:
         (1, camera.fy, camera.cy, camera.height),
         (0, camera.fx, camera.cx, camera.width),
     ):
-        found = (local[..., axis] / safe * focal + middle) * scale
-        low = np.clip(np.floor(found.min(1)) - 1, 0, size * scale).astype(int)
-        high = np.clip(np.ceil(found.max(1)) + 1, 0, size * scale).astype(int)
+        positions = (local[..., axis] / safe * focal + middle) * scale
+        low = np.clip(np.floor(positions.min(1)) - 1, 0, size * scale).astype(int)
+        high = np.clip(np.ceil(positions.max(1)) + 1, 0, size * scale).astype(int)
         bounds.append((np.where(behind, 0, low), np.where(behind, round(size * scale), high)))
     for top, bottom, left, right in zip(*bounds[0], *bounds[1], strict=True):
         empty = bottom <= top or right <= left
@@ -154,10 +154,10 @@ def _places(camera: Camera, rays: Rays, corners: Float) -> list[Place | None]:
     return places
 
 
-def _light(rays: Rays, seen: list[_Seen], depth: Tensor) -> Tensor:
+def _light(rays: Rays, solids: list[_PlacedSolid], depth: Tensor) -> Tensor:
     """Whether the sun reaches the points at `depth` [H, W], bool."""
     light = torch.ones(depth.shape, dtype=torch.bool)
-    for each in seen:
+    for each in solids:
         if each.shadow is not None:
             light[each.shadow] &= ~each.solid.shades(rays.part(*each.shadow), depth[each.shadow], SUN)
     return light
@@ -171,12 +171,12 @@ class _Faces:
     textures: Tensor
 
     @classmethod
-    def of(cls, seen: list[_Seen]) -> _Faces:
+    def of(cls, solids: list[_PlacedSolid]) -> _Faces:
         width = sum(LOOKS.values())
         table = torch.from_numpy(
-            np.concatenate([np.zeros((0, FACES, width), np.float32), *(s.looks[None] for s in seen)])
+            np.concatenate([np.zeros((0, FACES, width), np.float32), *(s.looks[None] for s in solids)])
         )
-        textures = np.concatenate([np.zeros((0, FACES), np.int64), *(s.textures[None] for s in seen)])
+        textures = np.concatenate([np.zeros((0, FACES), np.int64), *(s.textures[None] for s in solids)])
         parts = torch.split_with_sizes(table.reshape(-1, width), list(LOOKS.values()), 1)
         columns = dict(zip(LOOKS, parts, strict=True))
         return cls(columns, torch.from_numpy(textures.reshape(-1)))
@@ -259,12 +259,12 @@ def _shaded(town: Town, faces: _Faces, rays: Rays, at: _Samples) -> Tensor:
     offset = faces.at(face, "offset")
     u, v = ((points * faces.at(face, name)).sum(1) + offset[:, k] for k, name in enumerate("uv"))
     numbers, counts = torch.unique_consecutive(faces.textures[face], return_counts=True)
-    start, found = 0, torch.empty_like(points)
+    start, texels = 0, torch.empty_like(points)
     for number, count in zip(numbers.tolist(), counts.tolist(), strict=True):
         run = slice(start, start + count)
         start += count
-        found[run] = town.textures[number].sample(u[run], v[run], footprint)
-    color[order] = found * tint
+        texels[run] = town.textures[number].sample(u[run], v[run], footprint)
+    color[order] = texels * tint
     return color
 
 

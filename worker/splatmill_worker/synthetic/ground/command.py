@@ -26,29 +26,29 @@ def main(arguments: list[str]) -> int:
     parser.add_argument(
         "--gps", type=float, default=Flight.gps, help="standard deviation of the measured places, in metres"
     )
-    given = parser.parse_args(arguments)
-    if not FEWEST <= given.photos <= MOST:
-        parser.error(f"--photos {given.photos}: a flight has {FEWEST} to {MOST:,} photos.")
+    options = parser.parse_args(arguments)
+    if not FEWEST <= options.photos <= MOST:
+        parser.error(f"--photos {options.photos}: a flight has {FEWEST} to {MOST:,} photos.")
     for name in ("width", "height"):
-        if not SMALLEST <= getattr(given, name) <= LARGEST:
-            parser.error(f"--{name} {getattr(given, name)}: a side has {SMALLEST} to {LARGEST} pixels.")
-    if not 1 <= given.samples <= 8:
-        parser.error(f"--samples {given.samples}: a pixel has 1 to 8 rays along each axis.")
-    if given.seed < 0:
-        parser.error(f"--seed {given.seed}: a seed is 0 or larger.")
-    if not 0.0 <= given.gps <= 1000.0:
-        parser.error(f"--gps {given.gps}: the standard deviation is 0 to 1000 metres.")
+        if not SMALLEST <= getattr(options, name) <= LARGEST:
+            parser.error(f"--{name} {getattr(options, name)}: a side has {SMALLEST} to {LARGEST} pixels.")
+    if not 1 <= options.samples <= 8:
+        parser.error(f"--samples {options.samples}: a pixel has 1 to 8 rays along each axis.")
+    if options.seed < 0:
+        parser.error(f"--seed {options.seed}: a seed is 0 or larger.")
+    if not 0.0 <= options.gps <= 1000.0:
+        parser.error(f"--gps {options.gps}: the standard deviation is 0 to 1000 metres.")
     try:
         capture(
-            given.directory, given.photos, given.width, given.height, given.seed, given.samples,
-            Flight(gps=given.gps), lambda done: _tell(done, given.photos),
+            options.directory, options.photos, options.width, options.height, options.seed, options.samples,
+            Flight(gps=options.gps), lambda done: _tell(done, options.photos),
         )  # fmt: skip
     except OSError as error:
-        print(f"Error: {error.filename or given.directory}: {error.strerror or error}.", file=sys.stderr)
+        print(f"Error: {error.filename or options.directory}: {error.strerror or error}.", file=sys.stderr)
         return 1
     print(
-        f"{given.photos} photos of the generated ground are in {given.directory / PHOTOS}, and their true cameras in "
-        f"{given.directory / TRUTH}"
+        f"{options.photos} photos of the generated ground are in {options.directory / PHOTOS}, and their true cameras "
+        f"in {options.directory / TRUTH}"
     )
     return 0
 

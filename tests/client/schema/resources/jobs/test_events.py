@@ -121,7 +121,7 @@ def test_a_report_keeps_what_it_does_not_know():
 def test_a_page_of_jobs_survives_a_state_of_a_later_server() -> None:
     job = {"id": "a", "capture": "b", "options": {}, "created_at": "2026-01-01T00:00:00Z"}
     page = JobPage.model_validate({"jobs": [job | {"state": "paused"}, job | {"state": "queued"}]})
-    assert [found.state.value for found in page.jobs] == ["paused", "queued"]
+    assert [entry.state.value for entry in page.jobs] == ["paused", "queued"]
     assert not page.jobs[0].state.final
     assert json.loads(page.model_dump_json())["jobs"][0]["state"] == "paused"
     assert "paused" not in list(JobState)

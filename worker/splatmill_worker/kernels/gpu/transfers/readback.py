@@ -31,16 +31,16 @@ class Readback:
         Waits only when nothing has ever arrived, or when the host is `AHEAD` steps in front.
         """
         self._pending.append((key, ToHost(values)))
-        found = []
+        results = []
         while self._pending:
             name, numbers = self._pending[0]
             if not numbers.arrived and self._latest is not None and len(self._pending) <= AHEAD:
                 break
             loss, l1, ssim, visible, pairs, refused = numbers.wait()
             self._latest = StepResult(loss, l1, ssim, int(visible), int(pairs), int(refused))
-            found.append((name, self._latest))
+            results.append((name, self._latest))
             self._pending.popleft()
-        return found
+        return results
 
     @property
     def latest(self) -> StepResult:

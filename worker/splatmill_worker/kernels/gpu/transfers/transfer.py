@@ -40,5 +40,5 @@ class ToHost:
         """Return the values, after waiting for the device to reach the copy."""
         if self._arrival is not None:
             self._arrival.synchronize()
-        found: list[float] = self._values.tolist()
-        return found
+        numbers: list[float] = self._values.tolist()
+        return numbers

@@ -21,16 +21,16 @@ FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 """Turns axes of OpenGL (x right, y up, z backward) into those of OpenCV (x right, y down, z forward), and back."""
 
 _OF_POSES: dict[str, Callable[[Float], npt.NDArray[Any]]] = {
-    "from camera to world with OpenCV axes": lambda given: np.linalg.inv(given),
-    "from world to camera with OpenGL axes": lambda given: FLIP @ given,
-    "from camera to world with OpenGL axes": lambda given: FLIP @ np.linalg.inv(given),
+    "from camera to world with OpenCV axes": lambda pose: np.linalg.inv(pose),
+    "from world to camera with OpenGL axes": lambda pose: FLIP @ pose,
+    "from camera to world with OpenGL axes": lambda pose: FLIP @ np.linalg.inv(pose),
 }
 
 CONVENTIONS: dict[str, dict[str, Callable[[Float], npt.NDArray[Any]]]] = {
     "transform_matrix is from camera to world, with OpenGL axes": {
-        "from camera to world with OpenCV axes": lambda given: FLIP @ given,
-        "from world to camera with OpenGL axes": lambda given: FLIP @ np.linalg.inv(given) @ FLIP,
-        "from world to camera with OpenCV axes": lambda given: np.linalg.inv(given) @ FLIP,
+        "from camera to world with OpenCV axes": lambda pose: FLIP @ pose,
+        "from world to camera with OpenGL axes": lambda pose: FLIP @ np.linalg.inv(pose) @ FLIP,
+        "from world to camera with OpenCV axes": lambda pose: np.linalg.inv(pose) @ FLIP,
     },
     "a COLMAP model has poses from world to camera, with OpenCV axes": _OF_POSES,
     "the file was read as its program writes it, and another program may have changed it": _OF_POSES,
@@ -69,6 +69,6 @@ def better(
 
     shares = {name: share(changed) for name, changed in CONVENTIONS[of_source(source)].items()}
     best = max(shares, key=lambda name: shares[name])
-    if shares[best] < 0.5 or shares[best] < CLEARLY * share(lambda given: given):
+    if shares[best] < 0.5 or shares[best] < CLEARLY * share(lambda pose: pose):
         return "", 0.0
     return best, shares[best]

@@ -89,9 +89,9 @@ def evidence_of(
     transparent = 0
     others = colors[np.random.default_rng(0).permutation(count)]
     for photo in photos(views, cancelled):
-        seen = photo.camera.project(points)
-        rows = np.flatnonzero(seen.inside)
-        row, column = seen.rows[rows].astype(np.int64), seen.columns[rows].astype(np.int64)
+        projection = photo.camera.project(points)
+        rows = np.flatnonzero(projection.inside)
+        row, column = projection.rows[rows].astype(np.int64), projection.columns[rows].astype(np.int64)
         if photo.alpha is not None:
             transparent += bool((photo.alpha < 255).any())
             alpha = torch.from_numpy(photo.alpha)[None].float()

@@ -25,10 +25,10 @@ def footprints(
     for view in views:
         stop_if(cancelled)
         camera = view.camera
-        seen = camera.project(points)
+        projection = camera.project(points)
         reduced = 1.0 if side is None else min(1.0, side / max(camera.width, camera.height))
-        rows = np.flatnonzero(seen.inside)
-        sizes = seen.depths[rows] / (reduced * min(camera.fx, camera.fy))
+        rows = np.flatnonzero(projection.inside)
+        sizes = projection.depths[rows] / (reduced * min(camera.fx, camera.fy))
         smallest[rows] = np.minimum(smallest[rows], sizes)
     return smallest
 

@@ -119,16 +119,16 @@ def _explained(
         searched = features_of(stored, LEAN, pool, on_progress, cancelled)
         turned = features_of(list(other.values()), LEAN, pool, on_progress, cancelled)
         for upright in (False, True):
-            found = list(searched)
+            photos = list(searched)
             for number, each in zip(other, turned, strict=True) if upright else ():
-                found[number] = each
-            cameras, features = [each.camera for each in found], [each.features for each in found]
+                photos[number] = each
+            cameras, features = [each.camera for each in photos], [each.features for each in photos]
             path = folder / f"{upright}.db"
             with closing(database_of(path, model_of(cameras), features)) as database:
                 matched = two_view.match_pairs(
                     ordered,
                     features,
-                    {index: index + 1 for index in range(len(found))},
+                    {index: index + 1 for index in range(len(photos))},
                     database,
                     seed,
                     pool,

@@ -82,19 +82,19 @@ def with_points(
     scene = with_loose_points(scene, cancelled)
     if not _lacks_points(scene):
         if _shows_others(scene, cancelled):
-            found = _search(scene, workdir, seed, on_progress, cancelled)
-            scene = replace(scene, warnings=(*scene.warnings, *_contradiction(scene, found)))
+            triangulation = _search(scene, workdir, seed, on_progress, cancelled)
+            scene = replace(scene, warnings=(*scene.warnings, *_contradiction(scene, triangulation)))
         return _with_stereo(scene, workdir, on_progress, cancelled)
     if _transparent(scene, cancelled):
         swept = _with_stereo(scene, workdir, on_progress, cancelled)
         if not _lacks_points(swept):
             return swept
-    found = _search(scene, workdir, seed, on_progress, cancelled)
-    scene = _with_triangulated(scene, found, cancelled)
+    triangulation = _search(scene, workdir, seed, on_progress, cancelled)
+    scene = _with_triangulated(scene, triangulation, cancelled)
     scene = _with_stereo(scene, workdir, on_progress, cancelled)
     if len(scene.points) >= LEAST_POINTS:
         return scene
-    return replace(scene, facts=scene.facts | {"no_points": _failure(scene, found)})
+    return replace(scene, facts=scene.facts | {"no_points": _failure(scene, triangulation)})
 
 
 def with_loose_points(scene: Scene, cancelled: Callable[[], bool]) -> Scene:
@@ -104,40 +104,40 @@ def with_loose_points(scene: Scene, cancelled: Callable[[], bool]) -> Scene:
     frame than the cameras. Points that all have one colour get the median of the photos that see them; none are kept
     where the photos agree on these no more than by chance.
     """
-    given = len(scene.points)
-    if scene.point_views is not None or not given:
+    count = len(scene.points)
+    if scene.point_views is not None or not count:
         return scene
-    stride = -(-given // MOST_LOOSE)
+    stride = -(-count // MOST_LOOSE)
     points, colors = scene.points[::stride], scene.colors[::stride]
     views = [view for view in scene.views if view.split != "test"]
     evidence = evidence_of(points, colors, views, cancelled)
     plain = bool((colors == colors[0]).all())
-    seen = seen_in(points, views, cancelled) if plain else None
-    kept = evidence.agreeing > 0 if seen is None else seen.counts > 0
+    appearance = seen_in(points, views, cancelled) if plain else None
+    kept = evidence.agreeing > 0 if appearance is None else appearance.counts > 0
     kept &= evidence.inside
-    note = _loose_note(given, len(points), int(kept.sum()), evidence, plain)
-    if seen is not None and seen.contradicted:
+    note = _loose_note(count, len(points), int(kept.sum()), evidence, plain)
+    if appearance is not None and appearance.contradicted:
         kept[:] = False
         note = (
-            f"The {given} points that came without tracks and without colours are not used: at their places, the "
-            f"photos differ by {seen.spread:.0f} levels of 255, and at exchanged places by {seen.by_chance:.0f}. Their "
-            "coordinates are probably not those of the cameras."
+            f"The {count} points that came without tracks and without colours are not used: at their places, the "
+            f"photos differ by {appearance.spread:.0f} levels of 255, and at exchanged places by "
+            f"{appearance.by_chance:.0f}. Their coordinates are probably not those of the cameras."
         )
-    elif seen is None and _elsewhere(evidence):
+    elif appearance is None and _elsewhere(evidence):
         kept[:] = False
         note = (
-            f"The {given} points that came without tracks are not used: the photos show their colours at "
+            f"The {count} points that came without tracks are not used: the photos show their colours at "
             f"{100 * evidence.agreement:.0f} % of the places, and exchanged colours at {100 * evidence.chance:.0f} %. "
             "Their coordinates are probably not those of the cameras."
         )
     return replace(
         scene,
         points=points[kept],
-        colors=(colors if seen is None else seen.colors)[kept],
+        colors=(colors if appearance is None else appearance.colors)[kept],
         notes=(*scene.notes, note),
         facts=scene.facts
         | {
-            "loose_points": given,
+            "loose_points": count,
             "loose_points_used": int(kept.sum()),
             "transparent_photos": evidence.transparent,
         },
@@ -170,13 +170,13 @@ def _shows_others(scene: Scene, cancelled: Callable[[], bool]) -> bool:
     return agreeing < OWN_PHOTOS * max(1, shown)
 
 
-def _loose_note(given: int, judged: int, kept: int, evidence: Evidence, plain: bool) -> str:
+def _loose_note(count: int, judged: int, kept: int, evidence: Evidence, plain: bool) -> str:
     unseen = int((evidence.shown == 0).sum())
     through = int((~evidence.inside).sum())
-    thinned = "" if judged == given else f" Every {-(-given // judged)}th was taken, {judged} in all."
+    thinned = "" if judged == count else f" Every {-(-count // judged)}th was taken, {judged} in all."
     why = "their colours were read from the photos" if plain else "photos show their colours"
     return (
-        f"{given} points came without tracks.{thinned} {kept} of them are used, since {why}; of the others, no photo "
+        f"{count} points came without tracks.{thinned} {kept} of them are used, since {why}; of the others, no photo "
         f"shows {unseen}, and {through} lie where a photo is transparent."
     )
 
@@ -209,51 +209,53 @@ def _searched(
 ) -> Triangulated:
     """What triangulation finds, with more features where the first ones give few points."""
     views = [view for view in scene.views if view.split != "test"]
-    found = triangulate(
+    first = triangulate(
         views, LEAN, source=scene.source, seed=seed, on_progress=on_progress, cancelled=cancelled
     )
-    if sum(map(len, found.tracks)) >= FEW_OBSERVATIONS * len(views) or contradicted(
-        found.agreeing, found.matches
+    if sum(map(len, first.tracks)) >= FEW_OBSERVATIONS * len(views) or contradicted(
+        first.agreeing, first.matches
     ):
-        return found
+        return first
     again = triangulate(
         views, STANDARD, source=scene.source, seed=seed, on_progress=on_progress, cancelled=cancelled
     )
-    spent = {stage: again.seconds[stage] + found.seconds[stage] for stage in again.seconds}
-    return replace(again if len(again.points) > len(found.points) else found, seconds=spent)
+    spent = {stage: again.seconds[stage] + first.seconds[stage] for stage in again.seconds}
+    return replace(again if len(again.points) > len(first.points) else first, seconds=spent)
 
 
-def _with_triangulated(scene: Scene, found: Triangulated, cancelled: Callable[[], bool]) -> Scene:
+def _with_triangulated(scene: Scene, triangulation: Triangulated, cancelled: Callable[[], bool]) -> Scene:
     """The scene with the triangulated points in place of its own few, and what is to be said about them."""
     used = [index for index, view in enumerate(scene.views) if view.split != "test"]
     kept = np.flatnonzero(
-        evidence_of(found.points, found.colors, [scene.views[index] for index in used], cancelled).inside
+        evidence_of(
+            triangulation.points, triangulation.colors, [scene.views[index] for index in used], cancelled
+        ).inside
     )
-    tracks = [found.tracks[row] for row in kept]
+    tracks = [triangulation.tracks[row] for row in kept]
     lengths = np.array([len(track) for track in tracks], np.int32)
-    given = len(scene.points)
+    own = len(scene.points)
     facts = {
         "triangulated_points": len(kept),
-        "matches": found.matches,
-        "verified_pairs": found.pairs,
-        "matches_explained_by_cameras": round(found.agreeing / max(1, found.matches), 4),
-        "cameras_contradicted": contradicted(found.agreeing, found.matches),
-        "match_error_px": None if not found.matches else round(found.disagreement, 3),
-        "features_per_photo": found.features,
-        "transparent_photos": found.transparent,
-        "seconds": found.seconds,
+        "matches": triangulation.matches,
+        "verified_pairs": triangulation.pairs,
+        "matches_explained_by_cameras": round(triangulation.agreeing / max(1, triangulation.matches), 4),
+        "cameras_contradicted": contradicted(triangulation.agreeing, triangulation.matches),
+        "match_error_px": None if not triangulation.matches else round(triangulation.disagreement, 3),
+        "features_per_photo": triangulation.features,
+        "transparent_photos": triangulation.transparent,
+        "seconds": triangulation.seconds,
     }
-    messages = [_triangulated_note(given, len(kept), found)]
-    warnings = [*scene.warnings, *_contradiction(scene, found)]
-    if len(kept) < LEAST_POINTS or len(kept) <= given:
+    messages = [_triangulated_note(own, len(kept), triangulation)]
+    warnings = [*scene.warnings, *_contradiction(scene, triangulation)]
+    if len(kept) < LEAST_POINTS or len(kept) <= own:
         return replace(
             scene, facts=scene.facts | facts, notes=(*scene.notes, *messages), warnings=tuple(warnings)
         )
     return replace(
         scene,
-        points=found.points[kept],
-        colors=found.colors[kept],
-        point_errors=found.errors[kept],
+        points=triangulation.points[kept],
+        colors=triangulation.colors[kept],
+        point_errors=triangulation.errors[kept],
         track_lengths=lengths,
         point_views=PointViews(
             np.concatenate([[0], np.cumsum(lengths, dtype=np.int64)]).astype(np.int64),
@@ -265,52 +267,56 @@ def _with_triangulated(scene: Scene, found: Triangulated, cancelled: Callable[[]
     )
 
 
-def _contradiction(scene: Scene, found: Triangulated) -> list[str]:
+def _contradiction(scene: Scene, triangulation: Triangulated) -> list[str]:
     """A warning where the cameras explain few of the matches; else none."""
-    if not contradicted(found.agreeing, found.matches):
+    if not contradicted(triangulation.agreeing, triangulation.matches):
         return []
     return [
-        f"The given cameras explain only {100 * found.agreeing / found.matches:.0f} % of the {found.matches} "
-        f"matches between the photos; half of them are off by {found.disagreement:.1f} pixels or more. The poses "
-        "or the intrinsics are wrong, or belong to other photos: correct them, or remove them to have the cameras "
-        "recovered from the photos." + _suggestion(scene.source, found)
+        f"The given cameras explain only {100 * triangulation.agreeing / triangulation.matches:.0f} % of the "
+        f"{triangulation.matches} matches between the photos; half of them are off by "
+        f"{triangulation.disagreement:.1f} pixels or more. The poses or the intrinsics are "
+        "wrong, or belong to other photos: correct them, or remove them to have the cameras recovered from the photos."
+        + _suggestion(scene.source, triangulation)
     ]
 
 
-def _suggestion(source: Source, found: Triangulated) -> str:
+def _suggestion(source: Source, triangulation: Triangulated) -> str:
     """What to do where the cameras fit the photos in another convention; else ""."""
-    if not found.convention:
+    if not triangulation.convention:
         return ""
     return (
-        f" Read as matrices {found.convention}, they explain {100 * found.convention_share:.0f} %: "
+        f" Read as matrices {triangulation.convention}, they explain {100 * triangulation.convention_share:.0f} %: "
         f"{conventions.of_source(source)}. Convert them."
     )
 
 
-def _triangulated_note(given: int, kept: int, found: Triangulated) -> str:
-    had = "no points" if not given else f"only {given} points"
+def _triangulated_note(own: int, kept: int, triangulation: Triangulated) -> str:
+    had = "no points" if not own else f"only {own} points"
     said = f"The cameras came with {had}. "
-    if not found.matches:
+    if not triangulation.matches:
         return said + "No points could be triangulated: no two photos match."
     return said + (
-        f"{kept} points were triangulated with them in {sum(found.seconds.values()):.1f} seconds; they explain "
-        f"{100 * found.agreeing / found.matches:.0f} % of {found.matches} matches between {found.pairs} pairs of "
-        f"photos, and half of the matches are off by {found.disagreement:.2f} pixels or less."
+        f"{kept} points were triangulated with them in {sum(triangulation.seconds.values()):.1f} seconds; they explain "
+        f"{100 * triangulation.agreeing / triangulation.matches:.0f} % of {triangulation.matches} matches "
+        f"between {triangulation.pairs} pairs of photos, and half of the matches are off by "
+        f"{triangulation.disagreement:.2f} pixels or less."
     )
 
 
-def _failure(scene: Scene, found: Triangulated) -> str:
+def _failure(scene: Scene, triangulation: Triangulated) -> str:
     """Why there are no points, for the plan."""
-    if found.features < 2 * two_view.MIN_INLIERS:
-        return f"Half of the photos have at most {found.features:.0f} features, too few to be matched."
-    if not found.matches:
-        return "No two photos match, so nothing could be triangulated with the given cameras."
-    if contradicted(found.agreeing, found.matches):
+    if triangulation.features < 2 * two_view.MIN_INLIERS:
         return (
-            f"The given cameras explain only {100 * found.agreeing / found.matches:.0f} % of the matches between the "
-            "photos, so nothing could be triangulated."
+            f"Half of the photos have at most {triangulation.features:.0f} features, too few to be matched."
         )
-    return f"Only {len(found.points)} points could be triangulated with the given cameras."
+    if not triangulation.matches:
+        return "No two photos match, so nothing could be triangulated with the given cameras."
+    if contradicted(triangulation.agreeing, triangulation.matches):
+        return (
+            f"The given cameras explain only {100 * triangulation.agreeing / triangulation.matches:.0f} % of the "
+            "matches between the photos, so nothing could be triangulated."
+        )
+    return f"Only {len(triangulation.points)} points could be triangulated with the given cameras."
 
 
 def _with_stereo(
@@ -322,12 +328,12 @@ def _with_stereo(
     return stereo.with_stereo_points(scene, stored, on_progress, cancelled)
 
 
-def _save(found: Triangulated, path: Path) -> None:
+def _save(triangulation: Triangulated, path: Path) -> None:
     """Write the result to the .npz file `path`, atomically."""
-    values: dict[str, Any] = asdict(found)
-    lengths = np.array([len(track) for track in found.tracks], np.int64)
-    values["tracks"] = np.array([index for track in found.tracks for index in track], np.int64)
-    values["seconds"] = json.dumps(found.seconds)
+    values: dict[str, Any] = asdict(triangulation)
+    lengths = np.array([len(track) for track in triangulation.tracks], np.int64)
+    values["tracks"] = np.array([index for track in triangulation.tracks for index in track], np.int64)
+    values["seconds"] = json.dumps(triangulation.seconds)
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as part, part.open("wb") as file:
         np.savez(file, **values, lengths=lengths)

@@ -59,11 +59,11 @@ def features_of(
             stop_if(cancelled)
             return _searched(load_view(view, effort.side, background=GREY), effort)
 
-    found = []
+    photos = []
     for each in pool.map(search_view, views):
-        found.append(each)
-        on_progress("features", len(found), len(views), views[len(found) - 1].name)
-    return found
+        photos.append(each)
+        on_progress("features", len(photos), len(views), views[len(photos) - 1].name)
+    return photos
 
 
 def _searched(photo: Photo, effort: Effort) -> Searched:
@@ -110,12 +110,12 @@ def database_of(
 ) -> pycolmap.Database:
     """A database of the model's cameras and images, and of the features."""
     database = pycolmap.Database.open(path)
-    for number, found in enumerate(features, 1):
+    for number, each in enumerate(features, 1):
         database.write_camera(model.cameras[number], use_camera_id=True)
         database.write_rig(model.rigs[number], use_rig_id=True)
         database.write_frame(model.frames[number], use_frame_id=True)
         database.write_image(model.images[number], use_image_id=True)
-        database.write_keypoints(number, found.points.astype(np.float32))
+        database.write_keypoints(number, each.points.astype(np.float32))
     return database
 
 

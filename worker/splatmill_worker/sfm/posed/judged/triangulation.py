@@ -100,11 +100,11 @@ def triangulate(
     longest = max(max(view.camera.width, view.camera.height) for view in views)
     with ThreadPoolExecutor(threads) as pool, torch_threads(1), tempfile.TemporaryDirectory() as folder:
         started = perf_counter()
-        found = features_of(views, effort, pool, on_progress, cancelled)
+        photos = features_of(views, effort, pool, on_progress, cancelled)
         seconds["features"] = perf_counter() - started
         started = perf_counter()
-        cameras = [each.camera for each in found]
-        features = [each.features for each in found]
+        cameras = [each.camera for each in photos]
+        features = [each.features for each in photos]
         model = model_of(cameras)
         path = Path(folder) / "database.db"
         with closing(database_of(path, model, features)) as database:
@@ -135,9 +135,9 @@ def triangulate(
     tracks, colors = [], []
     points = list(model.points3D.values())
     for point in points:
-        seen = [(element.image_id - 1, element.point2D_idx) for element in point.track.elements]
-        tracks.append(tuple(sorted({view for view, _ in seen})))
-        colors.append(np.mean([found[view].colors[row] for view, row in seen], axis=0))
+        observations = [(element.image_id - 1, element.point2D_idx) for element in point.track.elements]
+        tracks.append(tuple(sorted({view for view, _ in observations})))
+        colors.append(np.mean([photos[view].colors[row] for view, row in observations], axis=0))
     return Triangulated(
         np.array([point.xyz for point in points]).reshape(-1, 3),
         np.array(colors).reshape(-1, 3).round().astype(np.uint8),
@@ -148,7 +148,7 @@ def triangulate(
         int((errors <= bound).sum()),
         enlarged * float(np.median(errors)) if len(errors) else np.nan,
         float(np.median([len(each.scales) for each in features])),
-        sum(each.transparent for each in found),
+        sum(each.transparent for each in photos),
         convention,
         share,
         {stage: round(value, 3) for stage, value in seconds.items()},

@@ -19,19 +19,21 @@ SLACK = 0.02
 """Share of the depth by which points of one surface may lie behind each other by their noise."""
 
 
-def visible(camera: Camera, seen: Projection) -> npt.NDArray[np.intp]:
+def visible(camera: Camera, projection: Projection) -> npt.NDArray[np.intp]:
     """Rows of the points that fall on the photo of `camera` and that no other of them hides.
 
-    seen: where the points fall. The nearest point in a cell hides what lies behind it; the cells are as small as the
-        number of points allows.
+    projection: where the points fall. The nearest point in a cell hides what lies behind it; the cells are as small as
+        the number of points allows.
     """
-    rows = np.flatnonzero(seen.inside)
+    rows = np.flatnonzero(projection.inside)
     if not len(rows):
         return rows
     cell = max(1.0, math.sqrt(PER_CELL * camera.width * camera.height / len(rows)))
     across = math.ceil(camera.width / cell)
-    at = (seen.rows[rows] / cell).astype(np.int64) * across + (seen.columns[rows] / cell).astype(np.int64)
+    at = (projection.rows[rows] / cell).astype(np.int64) * across + (projection.columns[rows] / cell).astype(
+        np.int64
+    )
     nearest = np.full(at.max() + 1, np.inf)
-    np.minimum.at(nearest, at, seen.depths[rows])
+    np.minimum.at(nearest, at, projection.depths[rows])
     limit = nearest[at] * (1.0 + SLACK + SLANT * cell / min(camera.fx, camera.fy))
-    return rows[seen.depths[rows] <= limit]
+    return rows[projection.depths[rows] <= limit]
