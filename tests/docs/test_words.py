@@ -40,10 +40,17 @@ def test_words_that_hold_a_turn_are_none_of_it():
         "for _{} in (): ...",
         "import os as {}",
         "with f() as {}: ...",
+        "class {}: ...",
     ],
 )
 def test_a_planted_name_is_found_in_python(code: str, name: str):
     assert list(problems("client/module.py", code.format(name))) != []
+
+
+@pytest.mark.parametrize("folder", [".ci", "docs", "server/web", "tests", "worker/bench"])
+def test_a_planted_name_is_found_in_every_folder_and_in_capitals(folder: str):
+    for name in ("FOUND", "_Seen"):
+        assert list(problems(f"{folder}/module.py", f"{name} = 1")) != []
 
 
 def test_a_planted_name_is_found_in_javascript():
