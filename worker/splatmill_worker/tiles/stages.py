@@ -31,7 +31,6 @@ from splatmill_worker.sfm.run import SFM
 from splatmill_worker.splat.engine.open import open_engine
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.plan.capacity import resolved
-from splatmill_worker.splat.plan.decide import GROWTH
 from splatmill_worker.splat.plan.photos import loading_size, statistics_memory
 from splatmill_worker.splat.plan.plan import Kernels, Plan
 from splatmill_worker.tiles import camera_parts, coarse_model, joined
@@ -179,14 +178,12 @@ def _coarse(context: Context, stages: Stages) -> dict[str, Any]:
         clustered=decided.cluster_culling,
         most_kept=statistics_memory(decided.max_memory, photos.size),
     )
-    # LPIPS is measured of the whole scene. Gaussians are added up to a share of the coarse training and a tile together
-    # (decisions: tile-growth), but not at the end of the former: they have settled when space is divided.
-    growth = min(GROWTH, decided.schedule.densify_until / COARSE_SHARE)
+    # LPIPS is measured of the whole scene.
     trained, _ = train_scene(
         job,
         cameras,
         photos,
-        replace(decided, lpips=False, schedule=replace(decided.schedule, densify_until=growth)),
+        replace(decided, lpips=False),
         engine,
     )
     if trained.failure is not None:
