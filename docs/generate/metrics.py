@@ -56,8 +56,8 @@ def _labels(family: Metric) -> tuple[str, ...]:
 
 
 def _together(family: Metric) -> tuple[str, str]:
-    text, way = family.documentation, ""
+    text, rule = family.documentation, ""
     for sentence, word in _TOGETHER.items():
         if text.endswith(sentence):
-            text, way = text.removesuffix(sentence).strip(), word
-    return text, way
+            text, rule = text.removesuffix(sentence).strip(), word
+    return text, rule

@@ -20,6 +20,7 @@ from splatmill.backplane import private_files
 from splatmill.backplane.connection import InvalidRedisUrl
 from splatmill.backplane.log_lines import LogFormat
 from splatmill.backplane.redact import redacted
+from splatmill.backplane.rendering import IDLE_TIMEOUT
 from splatmill.backplane.storage import layout
 from splatmill.backplane.storage.storage import Storage, StorageError
 from splatmill_server.access.exposure import NeedsKey
@@ -74,7 +75,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"splatmill_server: {error}", file=sys.stderr)
         return 2
     config = uvicorn.Config(
-        app, log_config=None, access_log=False, timeout_graceful_shutdown=GRACE_SECONDS, **tls_options
+        app,
+        log_config=None,
+        access_log=False,
+        timeout_graceful_shutdown=GRACE_SECONDS,
+        timeout_keep_alive=IDLE_TIMEOUT,
+        **tls_options,
     )
     log.info("serving", address=_address(listener), storage=redacted(settings.storage))
     _check_modes(app.state.service.storage, settings)

@@ -27,16 +27,17 @@ class PointBatches:
         points = points[np.isfinite(points).all(axis=1)]
         if len(points) > BATCH:
             points = points[morton_order(torch.from_numpy(points), cubic=True).numpy()]
+        balls = [self._balls]
         for first in range(0, len(points), BATCH):
             batch = points[first : first + BATCH]
             middle = (batch.min(axis=0) + batch.max(axis=0)) / 2
             radius = np.sqrt(np.square(batch - middle).sum(axis=1).max())
             self._batches.append(batch)
-            ball = np.array([[*middle, radius + SLACK * (radius + np.abs(middle).max())]])
-            self._balls = np.concatenate([self._balls, ball])
+            balls.append(np.array([[*middle, radius + SLACK * (radius + np.abs(middle).max())]]))
+        self._balls = np.concatenate(balls)
 
     def near(self, camera: Camera) -> Float:
-        """All points [n,3] that fall into the photo of `camera`, and some that do not, in no order of their own."""
+        """All points [n,3] that fall into the photo of `camera`, and some that do not, in any order."""
         x, y, z = camera.to_camera(self._balls[:, :3]).T
         radius = self._balls[:, 3]
         shown = z > -radius

@@ -1,11 +1,10 @@
-"""How long the API keeps idle connections, and the certificate of a server that answers over HTTPS by itself."""
+"""The certificate of a server that answers over HTTPS by itself."""
 
 import hashlib
 import ssl
 from pathlib import Path
 from typing import Any
 
-from splatmill.backplane.rendering import IDLE_TIMEOUT
 from splatmill_server.base.settings import Settings
 
 
@@ -16,13 +15,12 @@ def fingerprint(certificate: Path) -> str:
 
 
 def uvicorn_options(settings: Settings) -> dict[str, Any]:
-    """Return the options of uvicorn for connections: when idle ones are closed, and the certificate, if any is named.
+    """Return the options with which uvicorn answers over HTTPS, or none where the settings name no certificate.
 
     Raises OSError if the certificate or its key cannot be used.
     """
-    options: dict[str, Any] = {"timeout_keep_alive": IDLE_TIMEOUT}
     if settings.tls_certificate is None:
-        return options
+        return {}
     try:
         ssl.create_default_context(ssl.Purpose.CLIENT_AUTH).load_cert_chain(
             settings.tls_certificate, settings.tls_key, lambda: ""
@@ -32,4 +30,4 @@ def uvicorn_options(settings: Settings) -> dict[str, Any]:
             f"SPLATMILL_TLS_CERTIFICATE={settings.tls_certificate} cannot be used: {error}. Name a certificate in PEM, "
             "and its private key without a password in SPLATMILL_TLS_KEY."
         ) from error
-    return options | {"ssl_certfile": settings.tls_certificate, "ssl_keyfile": settings.tls_key}
+    return {"ssl_certfile": settings.tls_certificate, "ssl_keyfile": settings.tls_key}

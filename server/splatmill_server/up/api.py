@@ -17,6 +17,7 @@ def main(descriptor: int) -> None:
     with uncollected():
         import uvicorn
 
+        from splatmill.backplane.rendering import IDLE_TIMEOUT
         from splatmill_server.__main__ import Server, allow_open_files, configure_logging
         from splatmill_server.app import create_app
         from splatmill_server.base.settings import Settings
@@ -34,6 +35,7 @@ def main(descriptor: int) -> None:
         log_config=None,
         access_log=False,
         timeout_graceful_shutdown=STOP_SECONDS,
+        timeout_keep_alive=IDLE_TIMEOUT,
         **uvicorn_options(settings),
     )
     Server(config, app).run(sockets=[listener])

@@ -87,7 +87,7 @@ class Built:
 def build(
     gaussians: Gaussians,
     cameras: Sequence[Camera],
-    request: MeshSettings,
+    settings: MeshSettings,
     *,
     antialias: bool = False,
     backend: ops.Backend | None = None,
@@ -116,22 +116,22 @@ def build(
     if not len(depths):
         raise NoSurface
     middle = float(depths.median())
-    voxel = request.voxel or FOOTPRINT * middle / _focal(views)
-    samples = samples_of(views, Region(REACH * middle, _around(request.box)))
+    voxel = settings.voxel or FOOTPRINT * middle / _focal(views)
+    samples = samples_of(views, Region(REACH * middle, _around(settings.box)))
     if len(samples.points) < LEAST:
         raise NoSurface
-    depth = levels(samples, voxel, exact=request.voxel is not None)
+    depth = levels(samples, voxel, exact=settings.voxel is not None)
     told(Progress(stage="laying a surface through the depths"))
-    whole = without_specks(_within(reconstruct(samples, depth), request.box), SPECK)
+    whole = without_specks(_within(reconstruct(samples, depth), settings.box), SPECK)
     if not len(whole.faces):
         raise NoSurface
     told(Progress(stage="simplifying the surface"))
-    mesh = simplified(whole, request.faces)
+    mesh = simplified(whole, settings.faces)
     told(Progress(stage="colouring the surface"))
     mesh = colored(mesh, views)
-    if request.texture is not None:
+    if settings.texture is not None:
         told(Progress(stage="painting a texture"))
-        mesh = textured(mesh, views, request.texture)
+        mesh = textured(mesh, views, settings.texture)
     return Built(mesh, len(views), middle, side_of(samples, depth), len(whole.faces))
 
 

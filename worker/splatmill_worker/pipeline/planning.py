@@ -37,7 +37,7 @@ class Planned:
     plan: what was decided.
     photos: at the size of the plan, and in the light that it decides on; None where they are to be loaded smaller.
     room: for them.
-    seeds: what may be added to the first Gaussians, by `photos`; None where it was not found by these.
+    seeds: points that may be added, found in `photos`; None where `photos` are others than those that were measured.
     """
 
     first: First
@@ -100,7 +100,7 @@ def _in_light(photos: Photos, facts: Facts, plan: Plan) -> Photos:
 
 
 def _measure_facts(job: Job, cameras: Cameras, photos: Photos, first: First) -> tuple[Facts, Seeds | None]:
-    """What can be measured before training: the scene, its photos, and how fast this machine trains it; and seeds."""
+    """What can be measured before training: the scene, its photos, how fast this machine trains it; and the seeds."""
     pixels = photos.training[0].full.rgb[..., 0].numel()
     most = resolved(pixels, len(photos.training)) if first.model is None else 0
     speed = probe(open_engine(first.gaussians, job.kernels), photos.training, most=most)

@@ -92,14 +92,14 @@ class _Views:
 def run(chosen: argparse.Namespace) -> int:
     """Run `clean-file` with its parsed arguments; returns the exit status."""
     edit = None if chosen.edit is None else EditModel.model_validate_json(chosen.edit)
-    request = CleanSettings(chosen.capture, edit, chosen.min_weight, chosen.image_size)
-    return main(chosen.model, chosen.out, request)
+    settings = CleanSettings(chosen.capture, edit, chosen.min_weight, chosen.image_size)
+    return main(chosen.model, chosen.out, settings)
 
 
-def main(model: Path, out: Path, request: CleanSettings) -> int:
+def main(model: Path, out: Path, settings: CleanSettings) -> int:
     """Clean a file, print what was removed, and return the exit status."""
     try:
-        cleaned = clean_file(model, out, request)
+        cleaned = clean_file(model, out, settings)
     except (ModelUnreadable, Refusal) as error:
         print(f"Error: {error.message}", file=sys.stderr)
         return REFUSED
@@ -114,7 +114,7 @@ def main(model: Path, out: Path, request: CleanSettings) -> int:
     return 0
 
 
-def clean_file(model: Path, out: Path, request: CleanSettings) -> Cleaned:
+def clean_file(model: Path, out: Path, settings: CleanSettings) -> Cleaned:
     """Write what cleaning leaves of the model in `model` to `out`, whose suffix names the format.
 
     Photos that cameras.json beside the model names as held out decide nothing; without a cameras.json, they are chosen
@@ -126,14 +126,14 @@ def clean_file(model: Path, out: Path, request: CleanSettings) -> Cleaned:
     whole, antialias = contents.gaussians, bool(contents.antialiased)
     cleaned = Cleaned(whole.count, whole.count)
     keep = torch.ones(whole.count, dtype=torch.bool)
-    if request.edit is not None:
-        keep = kept(whole, request.edit)
+    if settings.edit is not None:
+        keep = kept(whole, settings.edit)
         cleaned.removed["outside the box"] = int((~keep).sum())
-    if (request.min_weight is not None or request.capture is not None) and bool(keep.any()):
-        views = _views(model, request, contents.offset)
+    if (settings.min_weight is not None or settings.capture is not None) and bool(keep.any()):
+        views = _views(model, settings, contents.offset)
         shift = views.frame.scale * torch.tensor(views.offset, dtype=torch.float64)
         shift += torch.from_numpy(views.frame.translation)
-        keep = _by_photos(whole.moved(views.frame.scale, shift), keep, views, request, antialias, cleaned)
+        keep = _by_photos(whole.moved(views.frame.scale, shift), keep, views, settings, antialias, cleaned)
     if not bool(keep.any()):
         raise Refusal(
             "option_out_of_range",
@@ -174,7 +174,7 @@ def _by_photos(
     gaussians: Gaussians,
     keep: Tensor,
     views: _Views,
-    request: CleanSettings,
+    settings: CleanSettings,
     antialias: bool,
     cleaned: Cleaned,
 ) -> Tensor:
@@ -184,15 +184,15 @@ def _by_photos(
     if views.photos:
         _check_world(gaussians.select(keep), views.training, antialias)
     before = [_mean(gaussians, each, background, antialias) for each in (views.training, views.held_out)]
-    if request.min_weight is not None:
+    if settings.min_weight is not None:
         rows = keep.nonzero()[:, 0]
         weights = evidence_of(gaussians.select(rows), targets, background, antialias=antialias).peak
-        light = rows[weights < request.min_weight]
+        light = rows[weights < settings.min_weight]
         keep[light] = False
-        cleaned.removed[f"weight below {request.min_weight:g}"] = len(light)
+        cleaned.removed[f"weight below {settings.min_weight:g}"] = len(light)
     if not views.photos:
         return keep
-    if request.capture is not None and bool(keep.any()):
+    if settings.capture is not None and bool(keep.any()):
         rows = keep.nonzero()[:, 0]
         cleaning = clean(gaussians.select(rows), targets, background, antialias=antialias)
         keep[rows[~cleaning.keep]] = False
@@ -222,10 +222,10 @@ def _check_world(gaussians: Gaussians, views: Sequence[TrainingView], antialias:
         ) from error
 
 
-def _views(model: Path, request: CleanSettings, offset: tuple[float, float, float]) -> _Views:
+def _views(model: Path, settings: CleanSettings, offset: tuple[float, float, float]) -> _Views:
     """The photos in the capture, or the cameras in the cameras.json beside the model where there is no capture."""
     stored = _stored(model)
-    if request.capture is None:
+    if settings.capture is None:
         if stored is None:
             raise Refusal(
                 "poses_invalid",
@@ -234,9 +234,9 @@ def _views(model: Path, request: CleanSettings, offset: tuple[float, float, floa
             )
         return _cameras_alone(stored)
     with ExitStack() as stack:
-        scene, own = _scene(request.capture, model, stack)
+        scene, own = _scene(settings.capture, model, stack)
         training, held_out = _split(scene, stored)
-        side = request.image_size or (DEFAULT_SIDE if stored is None else _longest(stored))
+        side = settings.image_size or (DEFAULT_SIDE if stored is None else _longest(stored))
         frame = Normalization.of(scene)
         shown, set_aside = (
             [TrainingView.of(photo, frame) for photo in load_views(views, side)]

@@ -92,7 +92,7 @@ def look(
 
 
 def loss(gaussians: Gaussians, originals: Sequence[RenderedView], *, antialias: bool) -> Loss:
-    """Compare the views of a converted model with the `originals` before, at least one, and with the photos."""
+    """Compare the views of a converted model with `originals`, those before the conversion, and with the photos."""
     views, before, after = [], [], []
     for view in originals:
         color = _colors(gaussians, view.camera, view.background, antialias)

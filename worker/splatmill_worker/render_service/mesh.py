@@ -51,11 +51,11 @@ def main(chosen: argparse.Namespace) -> int:
         _serve(chosen.parent)
     told = _sent if chosen.parent is not None else _Lines().told
     box = None if chosen.box is None else Box.model_validate_json(chosen.box)
-    request = MeshSettings(
+    settings = MeshSettings(
         chosen.faces, chosen.voxel, None if box is None else (box.min, box.max), chosen.texture
     )
     try:
-        built = mesh_file(chosen.model, chosen.out, request, chosen.cameras, chosen.up, chosen.backend, told)
+        built = mesh_file(chosen.model, chosen.out, settings, chosen.cameras, chosen.up, chosen.backend, told)
     except (ModelUnreadable, Refusal) as error:
         if chosen.parent is not None:
             print(MeshLine(problem=error.problem()).encoded().decode(), end="", flush=True)
@@ -83,7 +83,7 @@ def main(chosen: argparse.Namespace) -> int:
 def mesh_file(
     model: Path,
     out: Path,
-    request: MeshSettings,
+    settings: MeshSettings,
     cameras: Path | None,
     up: str,
     backend: ops.Backend | None,
@@ -105,7 +105,7 @@ def mesh_file(
     every = cameras_for(stored, gaussians, AXES[up])
     try:
         built = build(
-            gaussians, every, request, antialias=bool(contents.antialiased), backend=backend, told=told
+            gaussians, every, settings, antialias=bool(contents.antialiased), backend=backend, told=told
         )
     except NoSurface as error:
         raise Refusal(

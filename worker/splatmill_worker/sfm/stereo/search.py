@@ -103,7 +103,7 @@ def find_points(
     Photos that a data set itself holds out for tests are left out. Those held out as every n-th photo are used, as
     structure from motion uses them too.
 
-    on_progress: called with the stage "stereo" and numbers of photos.
+    on_progress: called with the stage "stereo" and numbers of photos, for loading them and then for searching them.
 
     Raises OSError when a photo does not decode, ValueError when it has another shape than its camera, and Cancelled
     when the caller has asked to stop.
@@ -112,10 +112,10 @@ def find_points(
     used = _used(scene)
     views = [scene.views[index] for index in used]
     count = len(views)
-    grey = _grey_views(views, cancelled)
+    grey = _grey_views(views, on_progress, cancelled)
     centers, axes = scene.centers[used], np.array([view.camera.axis for view in views])
     target = looked_at(centers, axes)
-    known, batches, shown = PointBatches(), list[SweepResult](), list[_Shown]()
+    known, batches, observers = PointBatches(), list[SweepResult](), list[_Observers]()
     known.add(scene.points)
     trial = np.unique(np.linspace(0, count - 1, min(TRIAL_PHOTOS, count)).round().astype(int))
     others = np.setdiff1d(np.arange(count), trial)
@@ -135,38 +135,38 @@ def find_points(
         if len(neighbours) >= MIN_AGREEING and 0.0 < near < far:
             result = sweep(grey[index], [grey[k] for k in neighbours], place, near, far)
             batches.append(result)
-            shown.append(_Shown.of(result, used[[index, *neighbours]]))
+            observers.append(_Observers.of(result, used[[index, *neighbours]]))
             known.add(result.points)
         if done == len(trial) and _yield(batches) < MIN_YIELD:
-            given_up, batches, shown = True, [], []
+            given_up, batches, observers = True, [], []
             break
     points = np.concatenate([np.zeros((0, 3)), *(batch.points for batch in batches)])
-    lengths = np.concatenate([np.zeros(0, np.int64), *(each.lengths for each in shown)])
+    lengths = np.concatenate([np.zeros(0, np.int64), *(each.lengths for each in observers)])
     kept = _inside_outlines(points, grey)
     longest = max((max(view.camera.width, view.camera.height) for view in views), default=SIDE)
     return StereoPoints(
         points[kept],
         np.concatenate([np.zeros((0, 3), np.uint8), *(batch.colors for batch in batches)])[kept],
         np.concatenate([np.zeros(0), *(batch.errors for batch in batches)])[kept] * max(1.0, longest / SIDE),
-        np.concatenate([np.zeros(0, np.int32), *(each.views for each in shown)])[np.repeat(kept, lengths)],
+        np.concatenate([np.zeros(0, np.int32), *(each.views for each in observers)])[np.repeat(kept, lengths)],
         np.concatenate([[0], np.cumsum(lengths[kept])]),
         time.perf_counter() - started,
         given_up,
     )
 
 
-class _Shown(NamedTuple):
+class _Observers(NamedTuple):
     """The views that show the points found in one photo: their numbers, in order for each point, and how many."""
 
     views: npt.NDArray[np.int32]
     lengths: npt.NDArray[np.int64]
 
     @staticmethod
-    def of(result: SweepResult, numbers: npt.NDArray[np.int64]) -> _Shown:
+    def of(result: SweepResult, numbers: npt.NDArray[np.int64]) -> _Observers:
         """numbers: of the photo and of its neighbours."""
         order = np.argsort(numbers)
         shows = np.column_stack([np.ones(len(result.points), bool), result.agreeing])[:, order]
-        return _Shown(numbers[order][np.nonzero(shows)[1]].astype(np.int32), shows.sum(axis=1))
+        return _Observers(numbers[order][np.nonzero(shows)[1]].astype(np.int32), shows.sum(axis=1))
 
 
 def _inside_outlines(points: Float, views: Sequence[GreyView]) -> npt.NDArray[np.bool_]:
@@ -187,7 +187,9 @@ def _used(scene: Scene) -> npt.NDArray[np.int64]:
     return np.array([i for i, view in enumerate(scene.views) if view.split != "test"], np.int64)
 
 
-def _grey_views(views: Sequence[View], cancelled: Callable[[], bool]) -> list[GreyView]:
+def _grey_views(
+    views: Sequence[View], on_progress: OnProgress, cancelled: Callable[[], bool]
+) -> list[GreyView]:
     """The views' photos at the size of the comparison. Raises Cancelled between two photos."""
     pool = ThreadPoolExecutor(min(LOADERS, os.cpu_count() or 1))
     try:
@@ -195,6 +197,7 @@ def _grey_views(views: Sequence[View], cancelled: Callable[[], bool]) -> list[Gr
         for view in pool.map(lambda view: GreyView.of(load_view(view, SIDE)), views):
             stop_if(cancelled)
             loaded.append(view)
+            on_progress("stereo", len(loaded), len(views), "photos loaded to be searched for more points")
         return loaded
     finally:
         pool.shutdown(cancel_futures=True)

@@ -186,16 +186,18 @@ def measure(
     speed: Speed | None,
     tell: Callable[[str], None] = lambda part: None,
 ) -> tuple[Facts, Seeds | None]:
-    """Facts of `scene`, whose training photos are `views` in the same world, of any origin and unit, and the seeds that
-    were found for them; None where points are too few, or photos transparent.
+    """Facts of `scene`, and the seeds found in its photos; None where its points are too few, or photos transparent.
 
-    held_out: number of held-out photos. speed: of this machine; None where it was not probed.
+    views: the training photos, in the world of `scene`, of any origin and unit.
+    held_out: number of held-out photos.
+    speed: of this machine; None where it was not probed.
     tell: called with what is measured of the photos, before each part that takes seconds where there are many.
     """
     tell("comparing the light of the photos")
     sizes = np.array([[view.full.camera.width, view.full.camera.height] for view in views])
     width, height = (int(value) for value in np.median(sizes, axis=0))
     observations = Observations.of(scene, views)
+    light = None if observations is None else compared(observations, views)
     survey = _coverage(scene, views, tell)
     facts = Facts(
         views=len(views),
@@ -210,7 +212,7 @@ def measure(
         distorted=sum(view.lens is not None for view in scene.views),
         faces=sum(view.face is not None for view in scene.views),
         halving_loss=float(np.median([halving_loss(view.full.rgb) for view in _some(views)])),
-        light=None if observations is None else compared(observations, views),
+        light=light,
         geometry=None
         if observations is None
         else Geometry(observations.view_angle(_own_points(scene)), observations.distance_ratio()),

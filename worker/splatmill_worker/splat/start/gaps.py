@@ -39,7 +39,7 @@ def gap_points(cells: Sequence[Cells]) -> tuple[Float, Pixels]:
         depths = np.full(grid.covered.shape, np.inf)
         depths[rows[:, 0], rows[:, 1]] = depth
         places = projected(grid.camera, earlier.near(grid.camera))
-        # Infinite where no depth is wanted, so that no earlier point agrees there.
+        # Infinite where the cell is no gap, so that no earlier point agrees there.
         expected = depths[places[:, 1].astype(np.int64), places[:, 0].astype(np.int64)]
         agree = (places[:, 2] < MAX_DEPTH_RATIO * expected) & (places[:, 2] > expected / MAX_DEPTH_RATIO)
         taken = cells_near(places[agree], grid.color.shape[:2], spread=0)

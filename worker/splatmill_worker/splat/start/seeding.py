@@ -23,7 +23,7 @@ Pixels = npt.NDArray[np.uint8]
 
 
 class Seeds(NamedTuple):
-    """Points [k, 3] and colours [k, 3] of what may be added, found in the photos as they are.
+    """Points [k, 3] that may be added, and their colours uint8 [k, 3].
 
     shell: on the far shell.
     gaps: in the gaps between the points.
@@ -61,7 +61,8 @@ def add_seeds(
         shell = far_shell.shell_points(cells, scene.points) if seeds is None else seeds.shell
         additions.append((*shell, far_shell.OPACITY))
     if fill_gaps:
-        tell("filling gaps between the points")
+        if seeds is None:
+            tell("filling gaps between the points")
         additions.append((*(gaps.gap_points(cells) if seeds is None else seeds.gaps), INITIAL_OPACITY))
     parts = [gaussians]
     room = max(0, max_gaussians - gaussians.count)

@@ -110,19 +110,19 @@ def disagreements(run: TrainingRun, learnt: Sequence[int]) -> tuple[Disagreement
     usual = sorted(comparison.median for comparison in comparisons)[len(comparisons) // 2]
     cut_out = [view.full.alpha is not None and int(view.full.alpha.min()) < SOLID for view in views]
     judged = [
-        _judged(view.name, photo, comparison, usual, whole=not cut and 2 * sum(cut_out) > len(views))
-        for view, photo, comparison, cut in zip(views, glances, comparisons, cut_out, strict=True)
+        _judged(view.name, glance, comparison, usual, whole=not cut and 2 * sum(cut_out) > len(views))
+        for view, glance, comparison, cut in zip(views, glances, comparisons, cut_out, strict=True)
     ]
     return tuple(sorted(judged, key=lambda each: -each.decibels))
 
 
-def _judged(name: str, photo: Glance, comparison: Comparison, usual: float, *, whole: bool) -> Disagreement:
+def _judged(name: str, glance: Glance, comparison: Comparison, usual: float, *, whole: bool) -> Disagreement:
     """whole: whether the photo is opaque, and most of the others are cut out: their light is not what differs."""
     share = float(comparison.outliers.float().mean())
     reason: Reason | None = None
-    if whole and (photo.light >= OTHER_LIGHT or comparison.decibels > 0.0):
+    if whole and (glance.light >= OTHER_LIGHT or comparison.decibels > 0.0):
         reason = "not cut out"
-    elif photo.light >= OTHER_LIGHT:
+    elif glance.light >= OTHER_LIGHT:
         reason = "other light"
     elif comparison.decibels <= 0.0:
         reason = None

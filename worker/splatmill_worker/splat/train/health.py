@@ -1,4 +1,4 @@
-"""Watches the loss of every step, and ends training by name when it diverges; and finds what is not finite."""
+"""Watches the loss of every step, and ends training by name when it diverges; and counts values that are not finite."""
 
 from __future__ import annotations
 

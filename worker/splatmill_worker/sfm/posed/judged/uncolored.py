@@ -30,7 +30,7 @@ LEAST_PAIRED = 20
 
 
 @dataclass(frozen=True)
-class Colored:
+class PointColors:
     """What the photos show at n points.
 
     counts: number of compared photos that see each point, by the depths of all points [n].
@@ -57,7 +57,9 @@ class Colored:
         return self.paired >= LEAST_PAIRED and self.by_chance > ONE_COLOR and not self.fits
 
 
-def seen_in(points: Float, views: Sequence[View], cancelled: Callable[[], bool] = lambda: False) -> Colored:
+def seen_in(
+    points: Float, views: Sequence[View], cancelled: Callable[[], bool] = lambda: False
+) -> PointColors:
     """Compare the photos of `views` at `points` [n,3]. Raises as `evidence.evidence_of` does."""
     chosen = views[:: max(1, -(-len(views) // MOST_PHOTOS))]
     shape = len(chosen), len(points), 3
@@ -84,7 +86,7 @@ def seen_in(points: Float, views: Sequence[View], cancelled: Callable[[], bool] 
         colors[part][some] = middle[some].round().astype(np.uint8)
         sums += apart[paired[part]].sum(), _medians(other[:, part], there[:, part])[1][paired[part]].sum()
     spread, by_chance = (float(value) for value in sums / max(1, int(paired.sum())))
-    return Colored(counts.astype(np.int64), colors, spread, by_chance, int(paired.sum()))
+    return PointColors(counts.astype(np.int64), colors, spread, by_chance, int(paired.sum()))
 
 
 def _medians(
