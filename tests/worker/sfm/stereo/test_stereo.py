@@ -175,7 +175,11 @@ def test_photos_held_out_by_the_data_set_take_no_part(
         else replace(view, split="train")
         for i, view in enumerate(bare.views)
     )
-    cloud = stereo.find_points(replace(bare, views=views))
+    calls: list[tuple[str, int, int]] = []
+    cloud = stereo.find_points(replace(bare, views=views), lambda *call: calls.append(call[:3]))
+    count = len(views) - len(tests)
+    numbers = [*range(1, count + 1), *range(count)]  # loaded, and then searched
+    assert calls == [("stereo", number, count) for number in numbers]
     assert len(cloud.points) > 300
     visible = shows(cloud, len(views))
     assert not visible[:, tests].any()
