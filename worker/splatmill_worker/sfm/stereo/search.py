@@ -142,13 +142,14 @@ def find_points(
             break
     points = np.concatenate([np.zeros((0, 3)), *(batch.points for batch in batches)])
     lengths = np.concatenate([np.zeros(0, np.int64), *(each.lengths for each in observers)])
+    views_of_points = np.concatenate([np.zeros(0, np.int32), *(each.views for each in observers)])
     kept = _inside_outlines(points, grey)
     longest = max((max(view.camera.width, view.camera.height) for view in views), default=SIDE)
     return StereoPoints(
         points[kept],
         np.concatenate([np.zeros((0, 3), np.uint8), *(batch.colors for batch in batches)])[kept],
         np.concatenate([np.zeros(0), *(batch.errors for batch in batches)])[kept] * max(1.0, longest / SIDE),
-        np.concatenate([np.zeros(0, np.int32), *(each.views for each in observers)])[np.repeat(kept, lengths)],
+        views_of_points[np.repeat(kept, lengths)],
         np.concatenate([[0], np.cumsum(lengths[kept])]),
         time.perf_counter() - started,
         given_up,
