@@ -110,8 +110,8 @@ def sweep(
     rays, patch = rays[textured], patch[textured]
     tried = len(patch)
     if not tried:
-        agreeing_none = np.zeros((0, len(neighbours)), bool)
-        return SweepResult(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), agreeing_none, 0)
+        nowhere = np.zeros((0, len(neighbours)), bool)
+        return SweepResult(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), nowhere, 0)
     patch = patch / patch.norm(dim=1, keepdim=True)
     poses = [other.camera.viewmat @ np.linalg.inv(camera.viewmat) for other in neighbours]
     inverse, pixels = _inverse_depths([other.camera for other in neighbours], poses, near, far)

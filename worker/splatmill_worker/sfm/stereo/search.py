@@ -164,7 +164,7 @@ class _Observers(NamedTuple):
 
     @staticmethod
     def of(result: SweepResult, numbers: npt.NDArray[np.int64]) -> _Observers:
-        """numbers: of the photo and of its neighbours."""
+        """Those of the points of `result`. numbers: of its photo and of the neighbours, among all views."""
         order = np.argsort(numbers)
         shows = np.column_stack([np.ones(len(result.points), bool), result.agreeing])[:, order]
         return _Observers(numbers[order][np.nonzero(shows)[1]].astype(np.int32), shows.sum(axis=1))
