@@ -1,5 +1,5 @@
-"""Proves that features and matches found in blocks are those that one process finds, also where a block was lost, and
-that the mapping begins from them.
+"""Proves that features, matches and models of clusters found in blocks are those that one process finds, also where a
+block was lost, and that the mapping begins from them.
 
 Proven on generated photos of two sizes, some of them masked. Does not prove that other machines find the blocks
 (tests/worker/service/units, tests/service/test_tiles.py).
@@ -22,6 +22,7 @@ from splatmill_worker.images.prepare import Prepared, prepare
 from splatmill_worker.sfm import blocks
 from splatmill_worker.sfm.blocks import Block
 from splatmill_worker.sfm.features import photos_in
+from splatmill_worker.sfm.mapping import apart, clusters
 
 pytestmark = pytest.mark.slow
 
@@ -41,14 +42,14 @@ def never() -> bool:
 def prepared(tmp_path_factory: pytest.TempPathFactory) -> Prepared:
     """Photos of two sizes, more than are matched exhaustively, of which one has a mask."""
     root = tmp_path_factory.mktemp("blocks")
-    synthetic.capture(root / "images", COUNT - 4, 240, 180, samples=1)
-    synthetic.capture(root / "small", 4, 160, 120, samples=1)
+    synthetic.capture(root / "images", COUNT - 4, 320, 240, samples=1)
+    synthetic.capture(root / "small", 4, 200, 150, samples=1)
     for path in (root / "small").iterdir():
         shutil.move(path, root / "images" / f"s-{path.name}")
     masked = sorted((root / "images").iterdir())[3]
     (root / "masks").mkdir()
-    mask = np.full((180, 240), 255, np.uint8)
-    mask[:, :60] = 0
+    mask = np.full((240, 320), 255, np.uint8)
+    mask[:, :80] = 0
     Image.fromarray(mask).save(root / "masks" / f"{masked.stem}.png")
     result = prepare(root / "images", root / "masks", root)
     assert (len(result.photos), sum(photo.mask is not None for photo in result.photos)) == (COUNT, 1)
@@ -141,6 +142,55 @@ def test_what_is_there_is_not_found_again(prepared: Prepared, tmp_path: Path) ->
         )
     first = next(index for index, (stage, _) in enumerate(stages) if stage == "mapping")
     assert {stage for stage, _ in stages[:first]} <= {"matching"}, "only pairs that connect components"
+
+
+@pytest.mark.parametrize("lost", [None, "features", "matches"])
+def test_clusters_mapped_in_blocks_are_those_of_one_process(
+    prepared: Prepared, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lost: str | None
+) -> None:
+    monkeypatch.setattr(clusters, "CLUSTER_PHOTOS", 8)
+    stages = [("", "")]
+    with pytest.raises(Cancelled):
+        sfm.reconstruct_photos(
+            prepared,
+            tmp_path / "whole",
+            OPTIONS,
+            lambda stage, done, total, note: stages.append((stage, note)),
+            lambda: stages[-1][0] == "mapping" and "part" not in stages[-1][1],
+        )
+    assert {note for stage, note in stages if stage == "mapping"} >= {
+        *("photos placed, part 1 of 2", "photos placed, part 2 of 2")
+    }
+    before, work = in_blocks(prepared, tmp_path, 3, 2 if lost == "features" else None)
+    if lost == "matches":
+        before = [part for part in before if part.name != "matches-2"]
+    parts = list(before)
+    for number in (1, 2, 3):
+        part = tmp_path / f"mapping-{number}"
+        placed = blocks.map_block(prepared, part, OPTIONS, Block(number, 3), before, silent, never)
+        assert (placed > 0) == (number < 3), "two clusters"
+        left = {path.relative_to(part).parts[3] for path in part.rglob("*") if path.is_file()}
+        assert left == ({"apart"} if number < 3 else set()), "nothing else is kept"
+        parts.append(part)
+    blocks.merge(parts, work, lambda done, total: None, never)
+    for number in (0, 1):
+        ours, theirs = (apart.folder_of(database_in(folder), number) for folder in (work, tmp_path / "whole"))
+        assert files_below(ours) == files_below(theirs) != set()
+        for name in files_below(ours):
+            assert (ours / name).read_bytes() == (theirs / name).read_bytes(), name
+    stages.clear()
+    with suppress(sfm.SfmFailed, Cancelled):
+        sfm.reconstruct_photos(
+            prepared,
+            work,
+            OPTIONS,
+            lambda stage, done, total, note: stages.append((stage, note)),
+            lambda: bool(stages) and stages[-1][0] == "mapping" and "part" not in stages[-1][1],
+        )
+    assert {note for stage, note in stages if "part" in note} == {
+        *("photos placed, part 1 of 2", "photos placed, part 2 of 2")
+    }, "each is read, not mapped"
+    assert sum("part" in note for _, note in stages) == 2
 
 
 def test_progress_is_that_of_the_block_and_a_cancelled_one_ends(prepared: Prepared, tmp_path: Path) -> None:

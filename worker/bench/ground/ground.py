@@ -46,7 +46,7 @@ WAYS = ("in one piece", "in tiles")
 MACHINES = (2, 4, 8)
 """Numbers of machines for which the time is worked out."""
 
-KINDS = {"features": "features", "matches": "matches", "tile": "tiles", "seam": "seams"}
+KINDS = {"features": "features", "matches": "matches", "mapping": "mapping", "tile": "tiles", "seam": "seams"}
 """Kinds of units of which there are several, and what several are called."""
 PHOTOS_PER_TILE = 30
 """Photos for each of which so many a scene gets one more tile, where --tiles does not say."""

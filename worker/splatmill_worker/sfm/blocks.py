@@ -1,7 +1,7 @@
 """The parts of structure from motion that several processes do at a time: the features of a block of photos, the scores
-of pairs of photos, and the matches of a block of pairs.
+of pairs of photos, the matches of a block of pairs, and the mapping of a block of clusters.
 
-Each leaves a COLMAP database, or the scores beside it, in the folder in which `reconstruct_photos` would have it.
+Each leaves a COLMAP database, or what lies beside it, in the folder in which `reconstruct_photos` would have it.
 `merge` brings them together there, and `reconstruct_photos` finds only what is missing. They are those of the first
 effort: a higher one, where it is tried, is left to `reconstruct_photos`.
 """
@@ -19,8 +19,16 @@ import numpy as np
 from splatmill_worker.colmap import pycolmap
 from splatmill_worker.images.prepare import Prepared
 from splatmill_worker.sfm.callbacks import OnProgress, stop_if
-from splatmill_worker.sfm.effort import SCORES, database_of, find_features, match, select_pairs
-from splatmill_worker.sfm.features import FEATURES, completed, merge_databases, photos_in
+from splatmill_worker.sfm.effort import (
+    SCORES,
+    database_of,
+    find_features,
+    map_clusters,
+    match,
+    select_pairs,
+)
+from splatmill_worker.sfm.features import FEATURES, completed, merge_databases, pairs_in, photos_in
+from splatmill_worker.sfm.mapping.apart import APART, stored_models
 from splatmill_worker.sfm.options import SfmOptions
 from splatmill_worker.sfm.run import SFM, EffortResult, SfmRun, opened
 from splatmill_worker.sfm.solve import efforts
@@ -120,6 +128,44 @@ def match_block(
     return len(own)
 
 
+def map_block(
+    prepared: Prepared,
+    workdir: Path,
+    options: SfmOptions,
+    block: Block,
+    before: Sequence[Path],
+    on_progress: OnProgress,
+    cancelled: Callable[[], bool],
+) -> int:
+    """Map a block of the clusters, and keep their models alone; returns the number of photos that they place.
+
+    before: work folders with the features of all blocks, the scores, and the matches of all blocks. What they lack is
+        found.
+
+    Raises Cancelled.
+    """
+    merge(before, workdir, _merging("mapping", on_progress), cancelled, without=("descriptors",))
+    with opened(prepared, workdir, options, on_progress, cancelled) as run:
+        result = _first_effort(run)
+        chosen = select_pairs(run, result)  # by the scores, without any features
+        lost = chosen - pairs_in(result.database)
+        if lost:  # with the block of photos or of pairs that they were in
+            merge(before, workdir, _merging("mapping", on_progress), cancelled)
+        find_features(run, result, None if lost else ())
+        with closing(pycolmap.Database.open(result.database)) as database:
+            match(run, result, chosen, database)
+        clusters = map_clusters(run, result, lambda count: range(block.number - 1, count, block.blocks))
+        placed = {
+            image
+            for number in clusters
+            for model in stored_models(result.database, number)
+            for image in model.reg_image_ids()
+        }
+    result.database.unlink()
+    result.database.with_name(SCORES).unlink(missing_ok=True)
+    return len(placed)
+
+
 def _first_effort(run: SfmRun) -> EffortResult:
     """The effort that is tried first, before it has found anything."""
     effort = efforts(run.options, run.count)[0]
@@ -154,4 +200,6 @@ def merge(
             target = workdir / source.relative_to(part)
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(source, target)
+        for models in sorted((part / SFM).glob(f"*/*/{APART}/*")):
+            shutil.copytree(models, workdir / models.relative_to(part), dirs_exist_ok=True)
         on_progress(number, len(parts))

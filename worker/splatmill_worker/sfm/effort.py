@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +14,8 @@ from splatmill_worker.colmap import pycolmap
 from splatmill_worker.errors import SfmFailed
 from splatmill_worker.opencv import VERSION as OPENCV_VERSION
 from splatmill_worker.sfm import features
-from splatmill_worker.sfm.mapping import mapper
+from splatmill_worker.sfm.mapping import apart, mapper
+from splatmill_worker.sfm.mapping.clusters import divide, number_of_clusters
 from splatmill_worker.sfm.mapping.registered import registered
 from splatmill_worker.sfm.matching import pairs, two_view
 from splatmill_worker.sfm.options import LEAN, Effort
@@ -54,14 +55,19 @@ def solve_at(run: SfmRun, effort: Effort, earlier: EffortResult | None) -> Effor
         if effort.name != LEAN.name:  # a higher effort may find more
             require_features(run, result)
         match(run, result, select_pairs(run, result), database)
+        kept = None if earlier is None or retried is None else _without(earlier.mapped, retried)
+        if kept is not None and 2 * kept.registered < run.count:
+            kept = None
+        # By these pairs alone, as other processes map them.
+        clusters = [] if kept is not None else map_clusters(run, result)
         _connect(run, result, database)
         if not result.verified:
             return result
-        kept = None if earlier is None or retried is None else _without(earlier.mapped, retried)
-        if kept is not None and 2 * kept.registered >= run.count:
+        if kept is not None:
             result.mapped = extended_mapping(run, result.database, kept)
         else:
-            result.mapped = best_mapping(run, result.database, result.verified)
+            models = [model for number in clusters for model in apart.stored_models(result.database, number)]
+            result.mapped = best_mapping(run, result.database, result.verified, models)
         left = _unregistered(run, result)
         if left and _match_unregistered(run, result, left, database):
             result.mapped = _mapped_with_more(run, result, result.mapped)
@@ -236,6 +242,48 @@ def match(run: SfmRun, result: EffortResult, chosen: set[pairs.Pair], database: 
             lambda done, _: run.on_progress("matching", before + done, total, "pairs matched"),
             run.cancelled,
         )
+
+
+def clusters_of(count: int, chosen: str) -> int:
+    """In how many clusters `count` photos are mapped, 0 where in none. chosen: the mapper of the options."""
+    return 0 if chosen == "global" else number_of_clusters(count)
+
+
+def map_clusters(
+    run: SfmRun, result: EffortResult, block: Callable[[int], Sequence[int]] = range
+) -> Sequence[int]:
+    """Map the clusters of the photos apart, where these are many; returns their numbers.
+
+    block: the numbers of those to map, of so many; the others are left out.
+
+    The models lie beside the database then.
+    """
+    if run.best_mapper == "global" or not clusters_of(run.count, run.options.mapper):
+        return ()
+    inliers = {pair: result.matched[pair].inliers for pair in result.verified}
+    clusters = divide(run.count, inliers)
+    chosen = block(len(clusters))
+    photos, placed = sum(len(clusters[number]) for number in chosen), 0
+    with run.clock("mapping"):
+        for number in chosen:
+            images = [result.ids[index] for index in clusters[number]]
+            words = f"photos placed, part {number + 1} of {len(clusters)}"
+
+            def report(done: int, before: int = placed, words: str = words) -> None:
+                run.on_mapping(before + done, photos, words)
+
+            apart.map_cluster(
+                result.database,
+                number,
+                images,
+                run.threads,
+                run.options.seed,
+                on_progress=report,
+                on_model=run.show,
+                cancelled=run.cancelled,
+            )
+            placed += len(images)
+    return chosen
 
 
 def _connect(run: SfmRun, result: EffortResult, database: pycolmap.Database) -> None:

@@ -137,6 +137,18 @@ def photos_in(path: Path, *, with_features: bool) -> set[int]:
         return {photo_index(name) for (name,) in database.execute(f"SELECT name FROM {table}")}
 
 
+def pairs_in(path: Path) -> set[tuple[int, int]]:
+    """The pairs of photos, by their indices, of which COLMAP's database at `path` has the two-view geometry."""
+    with closing(_read_only(path)) as database:
+        indices = {
+            number: photo_index(name)
+            for number, name in database.execute("SELECT image_id, name FROM images")
+        }
+        numbers = [number for (number,) in database.execute("SELECT pair_id FROM two_view_geometries")]
+    pairs = [(indices[number // MAX_IMAGES], indices[number % MAX_IMAGES]) for number in numbers]
+    return {(min(pair), max(pair)) for pair in pairs}
+
+
 def completed(path: Path, features_of: Collection[int]) -> None:
     """Make COLMAP's database at `path` a file by itself, which any number of machines read at a time.
 

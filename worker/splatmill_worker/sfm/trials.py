@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
+from splatmill_worker.colmap import pycolmap
+from splatmill_worker.sfm.features import photo_index
 from splatmill_worker.sfm.mapping import mapper
 from splatmill_worker.sfm.matching import pairs
 from splatmill_worker.sfm.run import SfmRun
@@ -20,8 +22,16 @@ def registered_counts(mapped: mapper.Mapped | None) -> tuple[int, int]:
     return len(mapped.reliable), mapped.registered
 
 
-def best_mapping(run: SfmRun, database: Path, verified: Collection[pairs.Pair]) -> mapper.Mapped:
+def best_mapping(
+    run: SfmRun,
+    database: Path,
+    verified: Collection[pairs.Pair],
+    apart: Sequence[pycolmap.Reconstruction] = (),
+) -> mapper.Mapped:
     """The best of up to three mappings: with the incremental mapper, with the global one, and with relaxed settings.
+
+    Before them, the models of clusters `apart` are joined, where there are any. They are enough only where none of the
+    photos that are connected is left in a model of its own: one mapping may place them with the others.
 
     The global one is the first where `mapper` asks for it, and where it registered more photos at an earlier effort
     (decisions: first-mapper).
@@ -32,13 +42,15 @@ def best_mapping(run: SfmRun, database: Path, verified: Collection[pairs.Pair]) 
     database: COLMAP's, with the two-view geometries of the `verified` pairs.
     """
     asked = run.options.mapper
-    connected = len(pairs.connected_components(run.count, verified)[0])
+    connected = set(pairs.connected_components(run.count, verified)[0])
     first: mapper.Mapper = "incremental"
     if asked != "auto":
         first = asked
     elif run.best_mapper is not None:
         first = run.best_mapper
     trials: list[tuple[mapper.Mapper, bool]] = [(first, False)]
+    if apart:
+        trials.insert(0, ("incremental", False))
     if asked == "auto":
         trials.append(("global" if first == "incremental" else "incremental", False))
     if asked != "global":
@@ -46,7 +58,7 @@ def best_mapping(run: SfmRun, database: Path, verified: Collection[pairs.Pair]) 
     best: mapper.Mapped | None = None
     best_rank = 0, 0
     with run.clock("mapping"):
-        for name, relaxed in trials:
+        for number, (name, relaxed) in enumerate(trials):
             mapped = mapper.run(
                 name,
                 database,
@@ -54,6 +66,7 @@ def best_mapping(run: SfmRun, database: Path, verified: Collection[pairs.Pair]) 
                 run.threads,
                 run.options.seed,
                 relaxed=relaxed,
+                apart=apart if number == 0 else (),
                 on_progress=run.on_mapping,
                 on_model=run.show,
                 cancelled=run.cancelled,
@@ -61,11 +74,18 @@ def best_mapping(run: SfmRun, database: Path, verified: Collection[pairs.Pair]) 
             rank = registered_counts(mapped)
             if best is None or rank > best_rank:
                 best, best_rank = mapped, rank
-            if best_rank[0] >= ENOUGH_REGISTERED * connected:
+            left_apart = apart and number == 0 and connected & _left_apart(mapped)
+            if best_rank[0] >= ENOUGH_REGISTERED * len(connected) and not left_apart:
                 break
     assert best is not None  # there is at least one trial
     run.best_mapper = best.mapper
     return best
+
+
+def _left_apart(mapped: mapper.Mapped) -> set[int]:
+    """Indices of the photos that other models than the largest have placed alone."""
+    first, *others = ({photo_index(m.images[i].name) for i in m.reg_image_ids()} for m in mapped.models)
+    return set().union(*others) - first
 
 
 def extended_mapping(run: SfmRun, database: Path, mapped: mapper.Mapped) -> mapper.Mapped:

@@ -1,8 +1,8 @@
 """The units before the cameras, which several processes share: the photos, features of a block of them, the pairs that
-may overlap, and the matches of a block of pairs.
+may overlap, the matches of a block of pairs, and the mapping of a block of clusters.
 
 They are left out, and the unit `cameras` does all of it, where the cameras are given or known, or where photos lie in
-zips and videos, which each of them would have to unpack.
+zips and videos, which each of them would have to unpack. Of the mapping, those are that have no cluster.
 """
 
 from __future__ import annotations
@@ -20,10 +20,11 @@ from splatmill_worker.pipeline.capture import photos_without_cameras, sfm_option
 from splatmill_worker.pipeline.events import progress_events
 from splatmill_worker.pipeline.job import Job
 from splatmill_worker.sfm import blocks
+from splatmill_worker.sfm.effort import clusters_of
 from splatmill_worker.sfm.run import SFM
 from splatmill_worker.sfm.solve import has_model
 from splatmill_worker.tiles.folder import facts_of
-from splatmill_worker.tiles.units import DIVIDED
+from splatmill_worker.tiles.units import CLUSTERS, DIVIDED
 
 
 def examine_photos(job: Job, out: Path) -> dict[str, Any]:
@@ -37,7 +38,11 @@ def examine_photos(job: Job, out: Path) -> dict[str, Any]:
     prepared_file.store(prepared, job.capture, out)
     known = has_model(prepared, job.workdir, sfm_options(job.options))
     count = len(prepared.photos)
-    return {"photos": count, DIVIDED: count >= MIN_PHOTOS and not known}
+    return {
+        "photos": count,
+        DIVIDED: count >= MIN_PHOTOS and not known,
+        CLUSTERS: clusters_of(count, job.options.mapper),
+    }
 
 
 def stored_photos(photos: Path, capture: Path) -> Prepared | None:
@@ -78,7 +83,7 @@ def block_of(name: str, parts: int) -> blocks.Block:
 def do_part(
     job: Job, name: str, parts: int, before: Sequence[Path], out: Path, known: Path | None
 ) -> dict[str, Any]:
-    """Do one of the units after `photos`: features and matches of a block, one of `parts`, or the pairs.
+    """Do one of the units after `photos`: features, matches and mapping of a block, one of `parts`, or the pairs.
 
     before: the outputs of the units that it needs, that of `photos` first.
     out: folder for its own.
@@ -95,6 +100,11 @@ def do_part(
     elif kind == "features":
         block = block_of(name, parts)
         facts = {"photos": blocks.find_block(prepared, job.workdir, options, block, report, stop)}
+    elif kind == "mapping":
+        block = block_of(name, parts)
+        if block.number > facts_of(photos)[CLUSTERS]:
+            return {}
+        facts = {"photos": blocks.map_block(prepared, job.workdir, options, block, others, report, stop)}
     else:
         block = block_of(name, parts)
         facts = {"pairs": blocks.match_block(prepared, job.workdir, options, block, others, report, stop)}

@@ -30,7 +30,7 @@ from splatmill_worker.errors import Cancelled, Refusal, WorkerError
 from splatmill_worker.memory import return_freed
 from splatmill_worker.tiles.folder import SCENE, Claimed, PlanFolder, digest_of, facts_of
 from splatmill_worker.tiles.retrying import may_pass
-from splatmill_worker.tiles.units import DIVIDED, ScenePlan
+from splatmill_worker.tiles.units import ScenePlan
 
 REFUSED, FAILED, UNWRITABLE, STOPPED, CLAIMED, BROKEN = 5, 3, 1, 130, 75, 70
 """Exit statuses, those of the command line: the plan or its photos cannot be used; a unit failed; a folder could not be
@@ -313,9 +313,10 @@ def _left_out(folder: PlanFolder) -> set[str]:
     """The units that the scene does not need: those before the cameras, where these are given or there already."""
     ended, states = folder.ended(), folder.states()
     photos = ended.get("photos")
-    divided = photos is None or photos.path is None or facts_of(photos.path).get(DIVIDED, True)
     names = {unit.name for unit in folder.plan.units} - folder.plan.pending(states) - set(ended)
-    return names if divided else names.union(folder.plan.camera_names[1:-1])
+    if photos is not None and photos.path is not None:
+        names |= folder.plan.left_out(facts_of(photos.path))
+    return names
 
 
 def _rows(folder: PlanFolder) -> list[dict[str, Any]]:

@@ -40,7 +40,7 @@ from splatmill_worker.tiles.units import ScenePlan
 WAIT_SECONDS = 1.0
 """Time between two looks for the tiles that other processes do, while nothing is left for this one."""
 
-STAGES = {"features": "features", "matches": "matching"}
+STAGES = {"features": "features", "matches": "matching", "mapping": "mapping"}
 """Stages of the progress of a job while other processes do its last units of a kind; of other kinds, it is `tiles`."""
 
 
@@ -215,7 +215,9 @@ def _check_parts(work: _Work, ended: Mapping[str, Ended]) -> None:
         return
     work.checked.append("photos")
     plan = work.folder.plan
-    if not has_parts(photos.path, work.folder.capture, work.workdir, plan.options):
+    if has_parts(photos.path, work.folder.capture, work.workdir, plan.options):
+        work.left_out.extend(plan.left_out(facts_of(photos.path)))
+    else:
         work.left_out.extend(plan.camera_names[1:-1])
 
 
@@ -274,7 +276,7 @@ def _forget_features(work: _Work) -> None:
     """Remove what only the cameras needed: features of 1,000 photos and their matches take 0.2 GB or more."""
     folder = work.folder
     outputs = [folder.output(name) for name in folder.plan.camera_names[1:-1]]
-    if not work.left_out:
+    if "pairs" not in work.left_out:
         work.others.forget(outputs)
     for path in outputs:
         if path.is_dir():
@@ -287,9 +289,11 @@ def _wait(work: _Work, parts: Sequence[str]) -> None:
     """Wait for units that other processes do."""
     plan, states = work.folder.plan, work.folder.states()
     kind = parts[0].partition("-")[0]
-    alike = {"features": plan.feature_names, "matches": plan.match_names}.get(
-        kind, plan.tile_names + plan.seam_names
-    )
+    alike = {
+        "features": plan.feature_names,
+        "matches": plan.match_names,
+        "mapping": [name for name in plan.mapping_names if name not in work.left_out],
+    }.get(kind, plan.tile_names + plan.seam_names)
     work.emit(
         ProgressEvent(
             stage=STAGES.get(kind, "tiles"),

@@ -40,8 +40,8 @@ MARGIN = 0.05
 holds four fifths of the coarse model."""
 
 COARSE_SHARE = 0.5
-"""Share of the steps of a whole run that the coarse training takes. A tile then uses each of its photos as often as the
-coarse training did."""
+"""Share of the steps of a whole run that the coarse training takes. A tile uses each of its photos as often as the other
+steps of a whole run would."""
 
 LAST = 0.2
 """Share of the steps of a tile that are taken beside the trained tiles around it (decisions: seams)."""
@@ -155,7 +155,8 @@ def tile_plan(coarse: Coarse, free: int, photos: int, *, last: bool = False) -> 
 
     last: of its last steps, in which no Gaussians are added.
 
-    Each photo that shows the tile is used as often as in the coarse training, and two steps are taken at least. So a
+    Each photo that shows the tile is used as often as by the steps that the coarse training leaves, and two steps are taken
+    at least. So a
     Gaussian gets about as many steps as in one piece, however many tiles there are (decisions: tile-steps). No photo is
     set aside: the coarse model has been trained on all of them, so that they could judge no more. Instead,
     where both trainings together use a photo more than MANY_VISITS times, a tile takes only the last part of the fall
@@ -170,7 +171,7 @@ def tile_plan(coarse: Coarse, free: int, photos: int, *, last: bool = False) -> 
     plan, schedule = coarse.plan, coarse.plan.schedule
     until, boost = 1.0 - LAST, schedule.annealing.boost
     share = photos / len(coarse.views)
-    total = max(2, round(share * coarse.steps))
+    total = max(2, round(share * coarse.steps * (1.0 - COARSE_SHARE) / COARSE_SHARE))
     first = max(1, min(total - 1, round(until * total)))
     steps = total - first if last else first
     earlier = coarse.steps / max(1, len(coarse.views))

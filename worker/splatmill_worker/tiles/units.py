@@ -11,20 +11,26 @@ from typing import Any, Literal
 
 from splatmill.schema import TrainOptions
 
-FORMAT = 8
+FORMAT = 9
 """Version of the plan's format and of what its units make: another one makes everything anew."""
 
 PHOTO_OPTIONS = ("max_video_frames", "seed", "sfm_effort", "matcher")
 """Options that features and matches follow from, and where these are kept."""
 
-CAMERA_OPTIONS = (*PHOTO_OPTIONS, "mapper", "scale", "start")
+MAPPING_OPTIONS = (*PHOTO_OPTIONS, "mapper")
+"""Options that the models of clusters follow from, and where these are kept."""
+
+CAMERA_OPTIONS = (*MAPPING_OPTIONS, "scale", "start")
 """Options that the cameras and the points follow from. The others do not change them."""
 
 DIVIDED = "divided"
 """Fact of the unit `photos`: whether the units between it and the cameras have something to do."""
 
+CLUSTERS = "clusters"
+"""Fact of the unit `photos`: the number of clusters in which the photos are mapped."""
+
 MOST_BLOCKS = 64
-"""Blocks of photos, and of their pairs, at most: more machines than that do not find the cameras together."""
+"""Blocks of photos, of their pairs and of their clusters, at most: more machines do not find the cameras together."""
 
 State = Literal["done", "failed"]
 
@@ -66,7 +72,7 @@ class ScenePlan:
 
     @property
     def blocks(self) -> int:
-        """How many parts the photos are divided into, and their pairs."""
+        """How many parts the photos are divided into, their pairs, and their clusters."""
         return min(self.tiles, MOST_BLOCKS)
 
     @cached_property
@@ -80,9 +86,14 @@ class ScenePlan:
         return tuple(f"matches-{number}" for number in range(1, self.blocks + 1))
 
     @cached_property
+    def mapping_names(self) -> tuple[str, ...]:
+        """The units that map a block of the clusters of photos each."""
+        return tuple(f"mapping-{number}" for number in range(1, self.blocks + 1))
+
+    @cached_property
     def camera_names(self) -> tuple[str, ...]:
         """The units whose outputs follow from the photos and CAMERA_OPTIONS alone. The last one makes the cameras."""
-        return ("photos", *self.feature_names, "pairs", *self.match_names, "cameras")
+        return ("photos", *self.feature_names, "pairs", *self.match_names, *self.mapping_names, "cameras")
 
     @cached_property
     def tile_names(self) -> tuple[str, ...]:
@@ -97,19 +108,20 @@ class ScenePlan:
     @cached_property
     def part_names(self) -> tuple[str, ...]:
         """The units that several machines do at a time, in the order of their numbers in the queue, from 1."""
-        return self.tile_names + self.seam_names + self.feature_names + self.match_names
+        return self.tile_names + self.seam_names + self.feature_names + self.match_names + self.mapping_names
 
     @cached_property
     def units(self) -> tuple[Unit, ...]:
         """All units, each after those that it needs."""
-        features, matches = self.feature_names, self.match_names
+        features, matches, mapping = self.feature_names, self.match_names, self.mapping_names
         tiles, seams = self.tile_names, self.seam_names
         return (
             Unit("photos"),
             *(Unit(name, ("photos",)) for name in features),
             Unit("pairs", ("photos", *features), features),
             *(Unit(name, ("photos", *features, "pairs"), features) for name in matches),
-            Unit("cameras", ("photos", *features, "pairs", *matches), features + matches),
+            *(Unit(name, ("photos", *features, "pairs", *matches), features + matches) for name in mapping),
+            Unit("cameras", ("photos", *features, "pairs", *matches, *mapping), features + matches + mapping),
             Unit("coarse", ("photos", "cameras")),
             *(Unit(name, ("coarse",)) for name in tiles),
             *(Unit(name, ("coarse", *tiles), tiles) for name in seams),
@@ -137,7 +149,11 @@ class ScenePlan:
         options = self._chosen
         if name in self.camera_names:
             # Where a block has failed, a unit after it does that itself, and makes the same.
-            used = CAMERA_OPTIONS if name == "cameras" else PHOTO_OPTIONS
+            used: tuple[str, ...] = PHOTO_OPTIONS
+            if name in self.mapping_names:
+                used = MAPPING_OPTIONS
+            elif name == "cameras":
+                used = CAMERA_OPTIONS
             own["options"] = {option: options[option] for option in used}
             if name in self.part_names:
                 own["blocks"] = self.blocks
@@ -145,6 +161,15 @@ class ScenePlan:
             own["options"] = options
             own["failed"] = [need for need in self.unit(name).optional if states.get(need) == "failed"]
         return hashlib.sha256(json.dumps(own, sort_keys=True).encode()).hexdigest()[:16]
+
+    def left_out(self, photos: Mapping[str, Any]) -> set[str]:
+        """Names of the units between `photos` and `cameras` that have nothing to do.
+
+        photos: facts of the unit `photos`.
+        """
+        if not photos[DIVIDED]:
+            return set(self.camera_names[1:-1])
+        return set(self.mapping_names[photos[CLUSTERS] :])
 
     def depends_on_failures(self, name: str) -> bool:
         """Whether the output of a unit is another one where units before it have failed."""

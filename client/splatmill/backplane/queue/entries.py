@@ -43,9 +43,9 @@ dies, its job is requeued when its lease has expired (see `leases`), after at mo
 KEEP_FINISHED = 24 * 3600
 """Seconds for which RQ keeps its record of a finished job. Splatmill's own stays until the job is deleted."""
 
-UNITS_PER_TILE = 4
+UNITS_PER_TILE = 5
 """Entries that a scene in tiles may have for each of them: features of a block of photos, matches of a block of pairs,
-its training from the coarse model, and its last steps."""
+the mapping of a block of clusters, its training from the coarse model, and its last steps."""
 
 KEEP_TILES = 60
 """Seconds for which RQ keeps its record of a tile that has ended: what the tile made is in storage by then."""

@@ -95,6 +95,24 @@ def test_large_features_that_bend_the_lens_are_left_out_and_their_points_follow_
         np.testing.assert_allclose(again.points3D[number].xyz, point.xyz, atol=1e-3)
 
 
+def test_points_that_were_not_adjusted_move_with_their_photos() -> None:
+    """By a motion of all photos as a whole, points of large features alone stay where these show them."""
+    model = model_of(ball, FOCAL, observed=POINTS)
+    scales = features_of(model, 0.4)
+    bend(model, scales)
+    small = without_large_features(model, scales)
+    assert small is not None
+    left_out = set(model.points3D) - set(small.points3D)
+    assert left_out
+    turn = pycolmap.Rotation3d(np.array([0.1, -0.2, 0.05, 0.97]) / np.linalg.norm([0.1, -0.2, 0.05, 0.97]))
+    motion = pycolmap.Sim3d(1.0, turn, np.array([0.3, -0.1, 0.7]))
+    before = {number: model.points3D[number].xyz.copy() for number in left_out}
+    small.transform(motion)
+    take_cameras(model, small)
+    for number in left_out:
+        np.testing.assert_allclose(model.points3D[number].xyz, motion * before[number], atol=1e-9)
+
+
 def test_large_features_as_good_as_small_ones_are_kept() -> None:
     model = model_of(ball, FOCAL, observed=POINTS)
     assert without_large_features(model, features_of(model, 0.4)) is None

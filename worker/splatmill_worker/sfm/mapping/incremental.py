@@ -28,6 +28,10 @@ WEAK_INLIERS, WEAK_INLIER_RATIO = 18, 0.15
 """Points that the pose of a photo which is left needs at least, and their share of its matches; COLMAP's defaults are
 30 and 0.25. `checks.deregister_outliers` judges the poses at the end."""
 
+SEAM_ITERATIONS = 5
+"""Iterations of the adjustment after models were joined, before tracks are connected across their seams (decisions:
+clusters)."""
+
 _Status = pycolmap.IncrementalPipelineStatus
 
 
@@ -81,6 +85,15 @@ class IncrementalMapping:
         self._grow(model, options)
         self._mapper.end_reconstruction(False)
         return int(model.num_reg_images()) - before
+
+    def joined(self, model: pycolmap.Reconstruction) -> None:
+        """Complete `model`, which several were merged into, in place: its tracks, and photos that are left."""
+        options = self._options.get_mapper()
+        self._mapper = pycolmap.IncrementalMapper(self._pipeline.database_cache)
+        self._mapper.begin_reconstruction(model)
+        self._complete(model, options)
+        self._grow(model, options)
+        self._mapper.end_reconstruction(False)
 
     def _grown(
         self, options: pycolmap.IncrementalMapperOptions, kept: int
@@ -151,6 +164,19 @@ class IncrementalMapping:
                     break
         return None
 
+    def _complete(self, model: pycolmap.Reconstruction, options: pycolmap.IncrementalMapperOptions) -> None:
+        """Connect tracks across the seams of a model that was joined, whose cameras are adjusted to the end later.
+
+        What does not fit yet is kept until an adjustment with a robust loss has moved the parts to each other.
+        """
+        self._mapper.complete_and_merge_tracks(self._triangulation)
+        self._mapper.retriangulate(self._triangulation)
+        self._solve(model, options, f"adjusting {model.num_reg_images()} cameras", seam=True)
+        self._mapper.complete_and_merge_tracks(self._triangulation)
+        self._mapper.filter_points(options)
+        self._mapper.filter_frames(options)
+        self._step(model)
+
     def _adjust(self, model: pycolmap.Reconstruction, options: pycolmap.IncrementalMapperOptions) -> None:
         """Adjust all cameras and points, complete and filter tracks, and again while that changes much."""
         self._mapper.complete_and_merge_tracks(self._triangulation)
@@ -167,10 +193,21 @@ class IncrementalMapping:
         self._mapper.filter_frames(options)
 
     def _solve(
-        self, model: pycolmap.Reconstruction, options: pycolmap.IncrementalMapperOptions, words: str
+        self,
+        model: pycolmap.Reconstruction,
+        options: pycolmap.IncrementalMapperOptions,
+        words: str,
+        *,
+        seam: bool = False,
     ) -> None:
-        """One bundle adjustment of all cameras and points, in several calls where one would take long."""
+        """One bundle adjustment of all cameras and points, in several calls where one would take long.
+
+        seam: of a model that was joined: a few iterations, with a robust loss.
+        """
         adjustment = self._options.get_global_bundle_adjustment()
+        if seam:
+            adjustment.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+            adjustment.ceres.solver_options.max_num_iterations = SEAM_ITERATIONS
         most = adjustment.ceres.solver_options.max_num_iterations
         at_once = iterations_at_once(model, most)
         adjustment.ceres.solver_options.max_num_iterations = at_once

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -62,6 +62,7 @@ def run(
     *,
     relaxed: bool = False,
     fixed_intrinsics: bool = False,
+    apart: Sequence[pycolmap.Reconstruction] = (),
     on_progress: Callable[[int, int, str], None],
     on_model: Callable[[pycolmap.Reconstruction], None] = lambda _: None,
     cancelled: Callable[[], bool],
@@ -70,6 +71,8 @@ def run(
 
     relaxed: accept smaller triangulation angles and fewer inliers (incremental mapper only).
     fixed_intrinsics: keep focal lengths and distortion as they are in the database.
+    apart: models of clusters of the photos (`models_of`), which the incremental mapper joins and completes. Without
+        them it begins with a first pair.
     on_progress: called as (photos placed, count, note) after each step of the incremental mapper; by the global one,
         which places all photos at once, every few seconds.
     on_model: called with the model that grows, after each step of the incremental mapper, which waits meanwhile.
@@ -77,12 +80,17 @@ def run(
     Raises Cancelled: between two steps of the incremental mapper, at the end in the global one.
     """
     stop_if(cancelled)
+    before, joined_notes = 0, tuple[str, ...]()
     database = pycolmap.Database.open(database_path)
     try:
         if mapper == "incremental":
             options = _incremental_options(threads, seed, relaxed, fixed_intrinsics)
             mapping = IncrementalMapping(database, options, _Steps(count, on_progress, on_model), cancelled)
-            models = sorted(mapping.models(), key=_size)
+            if apart:
+                models, before, joined_notes = merge_models(sorted(apart, key=_size))
+                mapping.joined(models[0])
+            else:
+                models = sorted(mapping.models(), key=_size)
             # Weak evidence is enough only beside a model of most photos: a small one may be of alike things.
             if models and 2 * models[0].num_reg_images() >= count:
                 mapping.extended(models[0])
@@ -95,7 +103,31 @@ def run(
     stop_if(cancelled)
     models.sort(key=_size)
     models, merged, notes = merge_models(models)
-    return Mapped(mapper, tuple(models), merged, notes)
+    return Mapped(mapper, tuple(models), before + merged, joined_notes + notes)
+
+
+def models_of(
+    database_path: Path,
+    images: Collection[int],
+    threads: int,
+    seed: int,
+    *,
+    on_progress: Callable[[int, int, str], None],
+    on_model: Callable[[pycolmap.Reconstruction], None],
+    cancelled: Callable[[], bool],
+) -> list[pycolmap.Reconstruction]:
+    """Models of some of the photos in COLMAP's database, by the incremental mapper, the largest first.
+
+    images: COLMAP's ids of the photos. The other arguments are those of `run`. Raises Cancelled between two steps.
+    """
+    options = _incremental_options(threads, seed, relaxed=False, fixed_intrinsics=False)
+    database = pycolmap.Database.open(database_path)
+    try:
+        options.image_names = [database.read_image(image).name for image in images]
+        steps = _Steps(len(images), on_progress, on_model)
+        return sorted(IncrementalMapping(database, options, steps, cancelled).models(), key=_size)
+    finally:
+        database.close()
 
 
 def extend(

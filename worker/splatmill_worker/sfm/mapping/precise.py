@@ -62,7 +62,11 @@ def without_large_features(model: pycolmap.Reconstruction, scales: Scales) -> py
 
 
 def take_cameras(model: pycolmap.Reconstruction, adjusted: pycolmap.Reconstruction) -> None:
-    """Give `model`, in place, the lenses, poses and points of a copy without some of its observations."""
+    """Give `model`, in place, the lenses, poses and points of a copy without some of its observations.
+
+    Points that the copy does not have move with the photos that observe them.
+    """
+    before = {image_id: model.images[image_id].cam_from_world() for image_id in adjusted.reg_image_ids()}
     for camera_id, camera in adjusted.cameras.items():
         model.cameras[camera_id].model, model.cameras[camera_id].params = camera.model, camera.params
     for image_id in adjusted.reg_image_ids():
@@ -70,6 +74,14 @@ def take_cameras(model: pycolmap.Reconstruction, adjusted: pycolmap.Reconstructi
         model.frames[image.frame_id].rig_from_world = adjusted.images[image_id].cam_from_world()
     for point_id, point in adjusted.points3D.items():
         model.points3D[point_id].xyz = point.xyz
+    motions = {
+        image_id: (model.images[image_id].cam_from_world().inverse() * pose).matrix()
+        for image_id, pose in before.items()
+    }
+    for point_id in set(model.points3D.keys()).difference(adjusted.points3D.keys()):
+        point = model.points3D[point_id]
+        motion = np.mean([motions[each.image_id] for each in point.track.elements], axis=0)
+        point.xyz = motion[:, :3] @ point.xyz + motion[:, 3]
 
 
 @dataclass(frozen=True)

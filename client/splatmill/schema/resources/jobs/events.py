@@ -149,8 +149,8 @@ class UnitEvent(Response):
     type: Literal["unit"] = "unit"
     unit: str = Field(
         max_length=64,
-        description="Name of the unit: photos, features-1, ..., pairs, matches-1, ..., cameras, coarse, tile-1, ..., "
-        "seam-1, ..., scene.",
+        description="Name of the unit: photos, features-1, ..., pairs, matches-1, ..., mapping-1, ..., cameras, "
+        "coarse, tile-1, ..., seam-1, ..., scene.",
     )
     state: Literal["running", "elsewhere", "done", "failed"] = Field(
         description="elsewhere: another worker had it when that of the job looked, between two of its units. What is "

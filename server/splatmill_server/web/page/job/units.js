@@ -5,9 +5,9 @@ import { number, seconds } from "../format.js";
 
 /** The kinds of units, in the order in which they are done. @type {[string, string][]} */
 const KINDS = [["photos", "Photos"], ["features", "Features of photos"], ["pairs", "Pairs of photos"], ["matches", "Matches of pairs"],
-  ["cameras", "Cameras"], ["coarse", "Coarse model"], ["tile", "Tiles"], ["seam", "Last steps of tiles"], ["scene", "Whole scene"]];
+  ["mapping", "Parts of the mapping"], ["cameras", "Cameras"], ["coarse", "Coarse model"], ["tile", "Tiles"], ["seam", "Last steps of tiles"], ["scene", "Whole scene"]];
 /** Those that are left out where no unit of the kind has begun: the cameras are given, or one unit finds them. */
-const OPTIONAL = ["features", "pairs", "matches"];
+const OPTIONAL = ["features", "pairs", "matches", "mapping"];
 /** Those of which there are as many as tiles. */
 const OF_TILES = ["tile", "seam"];
 /** Names that are written out; of others, their number is. */
@@ -43,7 +43,7 @@ export function unitParts(units) {
 function work(units) {
   const words = { running: "", elsewhere: " on other workers", failed: " failed" };
   return Object.entries(words).flatMap(([state, where]) => {
-    const names = units.filter((unit) => unit.state === state).map(({ unit }) => unit.replace(/^(features|matches|tile|seam)-/, ""));
+    const names = units.filter((unit) => unit.state === state).map(({ unit }) => unit.replace(/^(features|matches|mapping|tile|seam)-/, ""));
     if (!names.length) return [];
     const several = names.every((name) => /^[0-9]+$/.test(name));
     const listed = !several ? (state === "running" ? "yes" : "") : names.length > MOST_NAMES ? number(names.length) : names.join(", ");

@@ -1,0 +1,187 @@
+"""Proves that clusters of a view graph are of one size, that photos which match each other stay together, and that
+clusters that were mapped apart are joined into one model of all photos.
+
+Proven on graphs of which the best cut is known, and on COLMAP's own generated matches. Does not prove how good the
+cameras of many photos are: `bench ground` measures that.
+"""
+
+from __future__ import annotations
+
+import random
+from contextlib import closing
+from itertools import chain, pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatmill_worker.colmap import pycolmap
+from splatmill_worker.errors import Cancelled
+from splatmill_worker.sfm.mapping import apart, clusters, mapper
+
+PHOTOS = 24
+
+
+@pytest.mark.parametrize(("count", "number"), [(0, 0), (499, 0), (500, 2), (749, 2), (1000, 4), (10_000, 40)])
+def test_only_captures_of_twice_the_size_of_a_cluster_have_clusters(count: int, number: int) -> None:
+    assert clusters.number_of_clusters(count) == number
+
+
+def grid(rows: int, columns: int) -> dict[tuple[int, int], int]:
+    """Photos in strips: each matches the next one, and less well the one in the next strip."""
+    edges = {}
+    for row in range(rows):
+        for column in range(columns):
+            photo = row * columns + column
+            if column + 1 < columns:
+                edges[photo, photo + 1] = 90
+            if row + 1 < rows:
+                edges[photo, photo + columns] = 40
+    return edges
+
+
+def cut(parts: list[list[int]], edges: dict[tuple[int, int], int]) -> int:
+    """The inliers between photos that no cluster has both of."""
+    return sum(weight for pair, weight in edges.items() if not any(set(pair) <= set(part) for part in parts))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_groups_that_hardly_match_each_other_are_told_apart(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Four groups of 30 photos, whose names are in no order, with a chain of single matches from one to the next."""
+    monkeypatch.setattr(clusters, "CLUSTER_PHOTOS", 30)
+    choose = random.Random(seed)
+    photos = list(range(120))
+    choose.shuffle(photos)
+    groups = [photos[start : start + 30] for start in range(0, 120, 30)]
+    edges = {}
+    for group in groups:
+        for _ in range(300):
+            first, second = sorted(choose.sample(group, 2))
+            edges[first, second] = choose.randint(40, 200)
+    for one, other in pairwise(groups):
+        edges[min(one[0], other[1]), max(one[0], other[1])] = 20
+    divided = clusters.divide(120, edges)
+    assert len(divided) == 4
+    for group in groups:
+        assert [part for part in divided if set(group) <= set(part)], "no group is divided"
+        assert len(max(divided, key=lambda part: len(set(group) & set(part)))) <= 32, "and has its neighbours"
+
+
+def test_strips_are_cut_across_their_shorter_side(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(clusters, "CLUSTER_PHOTOS", 100)
+    monkeypatch.setattr(clusters, "SHARED", 0.0)
+    edges = grid(10, 20)
+    divided = clusters.divide(200, edges)
+    assert [len(part) for part in divided] == [100, 100]
+    assert sorted(chain(*divided)) == list(range(200))
+    assert cut(divided, edges) <= 20 * 40  # along the strips; across all of them it is 900
+
+
+def test_a_cluster_has_the_nearest_photos_of_its_neighbours_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(clusters, "CLUSTER_PHOTOS", 40)
+    edges = {(photo, photo + step): 100 // step for step in (1, 2, 3) for photo in range(80 - step)}
+    first, second = sorted(clusters.divide(80, edges))
+    assert first == list(range(43)), "three that match it, of five that it may have"
+    assert second == list(range(37, 80))
+
+
+def test_photos_without_matches_are_in_some_cluster(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(clusters, "CLUSTER_PHOTOS", 10)
+    divided = clusters.divide(40, {(0, 1): 30})
+    assert sorted(chain(*divided)) == list(range(40))
+    assert clusters.divide(40, {(0, 1): 30}) == divided
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, pycolmap.Reconstruction]:
+    """A database with the matches of PHOTOS photos, and their true poses."""
+    path = tmp_path_factory.mktemp("clusters") / "database.db"
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs = options.num_cameras_per_rig = 1
+    options.num_frames_per_rig, options.num_points3D = PHOTOS, 300
+    pycolmap.set_random_seed(0)
+    with closing(pycolmap.Database.open(path)) as database:
+        return path, pycolmap.synthesize_dataset(options, database)
+
+
+def mapped_apart(
+    path: Path, parts: list[list[int]], placed: list[int] | None = None
+) -> list[pycolmap.Reconstruction]:
+    for number, images in enumerate(parts):
+        apart.map_cluster(
+            path,
+            number,
+            images,
+            1,
+            0,
+            on_progress=lambda done: None if placed is None else placed.append(done),
+            on_model=lambda model: None,
+            cancelled=lambda: False,
+        )
+    return [model for number in range(len(parts)) for model in apart.stored_models(path, number)]
+
+
+def joined(path: Path, models: list[pycolmap.Reconstruction]) -> mapper.Mapped:
+    return mapper.run(
+        "incremental", path, PHOTOS, 1, 0, apart=models, on_progress=lambda *_: None, cancelled=lambda: False
+    )
+
+
+def test_clusters_are_mapped_once_and_joined(scene: tuple[Path, pycolmap.Reconstruction]) -> None:
+    path, truth = scene
+    ids = sorted(truth.reg_image_ids())
+    parts = [ids[:10], ids[6:17], ids[13:]]
+    placed: list[int] = []
+    models = mapped_apart(path, parts, placed)
+    assert [model.num_reg_images() for model in models] == [10, 11, 11]
+    assert {10, 11} <= set(placed)
+    assert all(set(model.reg_image_ids()) <= set(part) for model, part in zip(models, parts, strict=True))
+    again: list[int] = []
+    mapped_apart(path, parts, again)
+    assert again == [10, 11, 11], "the stored ones are read"
+    mapped = joined(path, models)
+    assert (mapped.registered, mapped.merged, len(mapped.models)) == (PHOTOS, 2, 1)
+    model = mapped.models[0]
+    aligned = pycolmap.align_reconstructions_via_proj_centers(model, truth, 0.1)
+    assert aligned is not None
+    for image_id in model.reg_image_ids():
+        place = aligned * model.images[image_id].projection_center()
+        np.testing.assert_allclose(place, truth.images[image_id].projection_center(), atol=1e-2)
+    one = mapper.run("incremental", path, PHOTOS, 1, 0, on_progress=lambda *_: None, cancelled=lambda: False)
+    assert one.models[0].num_points3D() == model.num_points3D()
+    assert one.models[0].compute_num_observations() == model.compute_num_observations(), (
+        "tracks cross the seams"
+    )
+
+
+def test_photos_that_no_cluster_has_are_added(
+    scene: tuple[Path, pycolmap.Reconstruction], tmp_path: Path
+) -> None:
+    path, truth = scene
+    ids = sorted(truth.reg_image_ids())
+    there = tmp_path / "database.db"
+    there.write_bytes(path.read_bytes())
+    models = mapped_apart(there, [ids[:9], ids[5:14]])
+    assert joined(there, models).registered == PHOTOS
+
+
+def test_a_cancelled_cluster_leaves_no_models(
+    scene: tuple[Path, pycolmap.Reconstruction], tmp_path: Path
+) -> None:
+    there = tmp_path / "database.db"
+    there.write_bytes(scene[0].read_bytes())
+    steps: list[int] = []
+    with pytest.raises(Cancelled):
+        apart.map_cluster(
+            there,
+            0,
+            sorted(scene[1].reg_image_ids()),
+            1,
+            0,
+            on_progress=steps.append,
+            on_model=lambda model: None,
+            cancelled=lambda: len(steps) > 3,
+        )
+    assert not apart.folder_of(there, 0).exists()
