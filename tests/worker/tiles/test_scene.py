@@ -313,7 +313,9 @@ def test_units_are_listed(whole: Path, tmp_path: Path, capsys: pytest.CaptureFix
         assert command.list_units(root, as_json=True) == 0
         rows = {row["unit"]: row for row in json.loads(capsys.readouterr().out)}
     assert {name: row["state"] for name, row in rows.items()} == {
-        **dict.fromkeys(("features-1", "features-2", "pairs", "matches-1", "matches-2"), "left out"),
+        **dict.fromkeys(
+            ("features-1", "features-2", "pairs", "matches-1", "matches-2", "mapping-1", "mapping-2"), "left out"
+        ),
         "photos": "done", "cameras": "done", "coarse": "done", "tile-1": "running", "tile-2": "done",
         "seam-1": "waiting", "seam-2": "waiting", "scene": "waiting",
     }  # fmt: skip
@@ -399,7 +401,8 @@ for name in names:
         unit.name: "failed" if unit.name == "tile-2" else "done" for unit in PlanFolder.open(root).plan.units
     }
     assert (root / "log").read_text().split() == [
-        *("photos", "features-1", "features-2", "pairs", "matches-1", "matches-2", "cameras", "coarse"),
+        *("photos", "features-1", "features-2", "pairs", "matches-1", "matches-2", "mapping-1", "mapping-2"),
+        *("cameras", "coarse"),
         *("tile-1", "tile-2", "tile-2", "tile-2", "seam-1", "seam-2", "scene"),
     ]
     assert "tile-2 was tried 3 times, and its process was killed" in capsys.readouterr().out

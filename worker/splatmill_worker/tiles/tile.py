@@ -40,8 +40,8 @@ MARGIN = 0.05
 holds four fifths of the coarse model."""
 
 COARSE_SHARE = 0.5
-"""Share of the steps of a whole run that the coarse training takes. A tile uses each of its photos as often as the other
-steps of a whole run would."""
+"""Share of the steps of a whole run that the coarse training takes. A tile uses each of its photos as often as the
+other steps of a whole run would."""
 
 LAST = 0.2
 """Share of the steps of a tile that are taken beside the trained tiles around it (decisions: seams)."""
@@ -155,10 +155,9 @@ def tile_plan(coarse: Coarse, free: int, photos: int, *, last: bool = False) -> 
 
     last: of its last steps, in which no Gaussians are added.
 
-    Each photo that shows the tile is used as often as by the steps that the coarse training leaves, and two steps are taken
-    at least. So a
-    Gaussian gets about as many steps as in one piece, however many tiles there are (decisions: tile-steps). No photo is
-    set aside: the coarse model has been trained on all of them, so that they could judge no more. Instead,
+    Each photo that shows the tile is used as often as by the steps that the coarse training leaves, and two steps are
+    taken at least. So a Gaussian gets about as many steps as in one piece, however many tiles there are (decisions:
+    tile-steps). No photo is set aside: the coarse model has been trained on all of them, so that they could judge no more. Instead,
     where both trainings together use a photo more than MANY_VISITS times, a tile takes only the last part of the fall
     of the rates, MANY_VISITS over that number: what so many steps learn at high rates is rather the photos than the
     scene (decisions: tile-rates).

@@ -167,9 +167,9 @@ class ScenePlan:
 
         photos: facts of the unit `photos`.
         """
-        if not photos[DIVIDED]:
+        if not photos.get(DIVIDED, True):
             return set(self.camera_names[1:-1])
-        return set(self.mapping_names[photos[CLUSTERS] :])
+        return set(self.mapping_names[photos.get(CLUSTERS, 0) :])
 
     def depends_on_failures(self, name: str) -> bool:
         """Whether the output of a unit is another one where units before it have failed."""
