@@ -157,10 +157,10 @@ def tile_plan(coarse: Coarse, free: int, photos: int, *, last: bool = False) -> 
 
     Each photo that shows the tile is used as often as by the steps that the coarse training leaves, and two steps are
     taken at least. So a Gaussian gets about as many steps as in one piece, however many tiles there are (decisions:
-    tile-steps). No photo is set aside: the coarse model has been trained on all of them, so that they could judge no more. Instead,
-    where both trainings together use a photo more than MANY_VISITS times, a tile takes only the last part of the fall
-    of the rates, MANY_VISITS over that number: what so many steps learn at high rates is rather the photos than the
-    scene (decisions: tile-rates).
+    tile-steps). No photo is set aside: the coarse model has been trained on all of them, so that they could judge no
+    more. Instead, where both trainings together use a photo more than MANY_VISITS times, a tile takes only the last
+    part of the fall of the rates, MANY_VISITS over that number: what so many steps learn at high rates is rather the
+    photos than the scene (decisions: tile-rates).
 
     Gaussians are added up to the share of both trainings after which one piece adds none: later ones learn what single
     photos show. A tile of fewer than some hundred steps adds none by then, and none does where that share ends with the
