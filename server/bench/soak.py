@@ -41,7 +41,7 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from _rows import Row, append, footer, lines, origin
+from _rows import Row, append, footer, lines, origin, rows_file
 from _soak import attempts, faults, verdict, words, work
 from _soak.clients import Clients
 from _soak.recovery import MEASURED, RESUME_SECONDS, recover
@@ -77,7 +77,7 @@ def main(argv: list[str]) -> int:
         help="multiply all time limits, for a machine that has other work",
     )
     parser.add_argument("--keep", type=Path, help="copy logs and the record of the attempts to this folder")
-    parser.add_argument("--results", type=Path, default=HERE / "results" / "soak.jsonl")
+    parser.add_argument("--results", type=rows_file, default=HERE / "results" / "soak.jsonl")
     parser.add_argument("--plot-only", action="store_true", help="write the table of the rows that are there")
     asked = parser.parse_args(argv)
     table = HERE / "soak.md" if asked.results.parent == HERE / "results" else asked.results.with_suffix(".md")

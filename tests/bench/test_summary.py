@@ -1,9 +1,11 @@
 """The README's table of what the service survives is that of the rows; each bench's line says what its rows say."""
 
+import importlib
 import json
 from pathlib import Path
 from typing import Any
 
+import pytest
 import summary
 from _page import filled
 
@@ -53,3 +55,13 @@ def test_the_newest_row_counts(tmp_path: Path) -> None:
     assert "| 15 changed files for 2 parsers | 1 crashed" in summary.table(tmp_path)
     write(tmp_path, "fuzz", row, row | {"inputs": 30, "fault": ""})
     assert "| 30 changed files for 1 parsers | 0 crashed" in summary.table(tmp_path)
+
+
+@pytest.mark.parametrize("bench", ["soak", "train", "gpu"])
+def test_a_folder_in_place_of_the_file_of_rows_is_refused_before_anything_is_measured(
+    bench: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    module = importlib.import_module(bench)
+    with pytest.raises(SystemExit):
+        module.main(["--out" if bench == "gpu" else "--results", str(tmp_path)])
+    assert f"{tmp_path} is a folder. Name a file for the rows" in capsys.readouterr().err

@@ -7,6 +7,7 @@ import os
 import platform
 import subprocess
 import sys
+from argparse import ArgumentTypeError
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from functools import cache
@@ -52,6 +53,16 @@ def origin(*parts: str) -> Row:
     except ImportError:  # a machine where only the GPU is measured: the C++ is not built there
         build = "no CPU kernels"
     return {"commit": commit, "machine": f"{model}, {cores} cores, {build}", "versions": versions}
+
+
+def rows_file(text: str) -> Path:
+    """The argument of a command that measures for hours and then writes its rows to this file."""
+    path = Path(text)
+    if path.is_dir():
+        raise ArgumentTypeError(
+            f"{text} is a folder. Name a file for the rows, such as {path / 'rows.jsonl'}."
+        )
+    return path
 
 
 def footer(rows: list[Row]) -> str:

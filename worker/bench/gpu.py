@@ -44,7 +44,7 @@ for folder in (
 import torch  # noqa: E402
 from _gpu import bandwidth, compared, errors, passes  # noqa: E402
 from _gpu.timing import Place  # noqa: E402
-from _rows import Row, append, lines, origin  # noqa: E402
+from _rows import Row, append, lines, origin, rows_file  # noqa: E402
 
 RESULTS = HERE / "results" / "gpu.jsonl"
 CAPTURES = ("fox_540x960", "lego_400")
@@ -197,7 +197,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("captures", nargs="*", type=Path, help="folders with photos and cameras")
     parser.add_argument("--only", nargs="+", metavar="PART", help="these parts alone")
     parser.add_argument("--dry", action="store_true", help="tiny sizes in Triton's interpreter, no times")
-    parser.add_argument("--out", type=Path, default=RESULTS, help="file that rows are added to")
+    parser.add_argument("--out", type=rows_file, default=RESULTS, help="file that rows are added to")
     parser.add_argument("--table", action="store_true", help="print the table of the rows that there are")
     wish = parser.parse_args(argv)
     if wish.table:

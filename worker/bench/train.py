@@ -26,7 +26,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from _rows import HERE, Row, append, lines
+from _rows import HERE, Row, append, lines, rows_file
 from _train import budgets, child, configurations, estimate, figure, official, scenes, tables
 from _train.rows import BenchRun, code_version, failed, idle, missing, runs_of
 from _train.scenes import Scene
@@ -277,7 +277,10 @@ def _parser() -> argparse.ArgumentParser:
         "--plot-only", action="store_true", help="draw tables and figure from the rows there are"
     )
     parser.add_argument(
-        "--results", type=Path, metavar="FILE", help="another file of rows; tables and figure go beside it"
+        "--results",
+        type=rows_file,
+        metavar="FILE",
+        help="another file of rows; tables and figure go beside it",
     )
     parser.add_argument(
         "--work",
