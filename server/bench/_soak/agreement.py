@@ -17,8 +17,14 @@ Listed = Mapping[str, Sequence[str]]
 """The ids that the API lists, by kind: captures, jobs and models."""
 
 
-def remains(connection: redis.Redis, storage: Storage) -> dict[str, list[str]]:
-    """Return what is still held of work, where no job is unfinished, by what it is. Raises UnreadableRecord."""
+def remains(
+    connection: redis.Redis, storage: Storage, restartable: Collection[str] = ()
+) -> dict[str, list[str]]:
+    """Return what is still held of work, where no job is unfinished, by what it is. Raises UnreadableRecord.
+
+    restartable: jobs that were cancelled, whose work in storage is kept for a restart.
+    """
+    kept = tuple(f"{layout.job_work(job)}/" for job in restartable)
     waiting = lines.look(connection)
     marks = [layout.unfinished_jobs(), layout.unfinished_imports(), layout.due_deliveries()]
     leftovers: dict[str, list[str]] = {
@@ -28,7 +34,9 @@ def remains(connection: redis.Redis, storage: Storage) -> dict[str, list[str]]:
         "locks": [key.decode() for key in connection.scan_iter(match=keys.lock("*"))],
         "marks of work in storage": [entry.path for mark in marks for entry in storage.walk(mark)],
         "checkpoints in storage": [
-            entry.path for entry in storage.walk(layout.jobs()) if "/work/" in entry.path
+            entry.path
+            for entry in storage.walk(layout.jobs())
+            if "/work/" in entry.path and not entry.path.startswith(kept)
         ],
     }
     return {what: held for what, held in leftovers.items() if held}

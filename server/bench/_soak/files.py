@@ -3,7 +3,7 @@
 import hashlib
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 from _soak.clients import Promise
@@ -70,11 +70,17 @@ def _not_whole(model: str, record: Mapping[str, Any], storage: Storage) -> list[
     return sentences
 
 
-def strays(storage: Storage) -> list[str]:
-    """Return a sentence for each file that nothing explains once no job runs, or that cannot be read."""
+def strays(storage: Storage, restartable: Collection[str] = ()) -> list[str]:
+    """Return a sentence for each file that nothing explains once no job runs, or that cannot be read.
+
+    restartable: jobs that were cancelled, whose work is kept for a restart.
+    """
     sentences = []
+    work = tuple(f"{layout.job_work(job)}/" for job in restartable)
     entries = {entry.path: entry for entry in storage.walk("")}
     for path, entry in sorted(entries.items()):
+        if path.startswith(work):
+            continue
         if not any(re.fullmatch(pattern, path) for pattern in _EXPECTED):
             sentences.append(f"{path} is in storage, where no job runs and nothing is being uploaded")
         elif (fault := _fault(entry, entries, storage)) is not None:

@@ -58,7 +58,7 @@ def check(service: Service, clients: Clients) -> list[str]:
             *attempts.run_again(records),
             *told_twice(connection, {line["job"] for line in records}),
             *files.halves(clients.promises.values(), storage),
-            *files.strays(storage),
+            *files.strays(storage, _cancelled(clients)),
             *differences,
         ]
 
@@ -153,7 +153,7 @@ def _agreed(
     while True:
         listed = {kind: _listed(service, kind) for kind in ("captures", "jobs", "models")}
         try:
-            held = agreement.remains(connection, storage)
+            held = agreement.remains(connection, storage, _cancelled(clients))
             differences = [f"there are still {what}: {names}" for what, names in held.items()]
             differences += agreement.compare(connection, storage, listed, clients.captures)
         except UnreadableRecord as error:
@@ -161,6 +161,10 @@ def _agreed(
         if not differences or time.monotonic() > end:
             return listed, differences
         time.sleep(1)
+
+
+def _cancelled(clients: Clients) -> list[str]:
+    return [promise.job for promise in clients.promises.values() if promise.state == "cancelled"]
 
 
 def _marked(trace: Path) -> list[int]:

@@ -278,6 +278,18 @@ def test_work_that_is_left_is_found(ended: Ended, what: str) -> None:
     assert what in agreement.remains(ended.redis, ended.storage)
 
 
+def test_the_units_of_a_cancelled_job_are_kept_for_a_restart(ended: Ended) -> None:
+    """Those of one that has succeeded are not."""
+    for job in (ended.cancelled, ended.job):
+        ended.storage.put(f"{layout.job_units(job)}/plan.json", b"{}")
+    left = f"{layout.job_units(ended.job)}/plan.json"
+    assert agreement.remains(ended.redis, ended.storage, [ended.cancelled]) == {
+        "checkpoints in storage": [left]
+    }
+    (sentence,) = files.strays(ended.storage, [ended.cancelled])
+    assert sentence.startswith(left)
+
+
 def test_an_end_that_is_told_twice_is_found(ended: Ended) -> None:
     assert verdict.told_twice(ended.redis, {ended.job, ended.cancelled}) == []
     events.append(ended.redis, ended.job, 1, 2, StateEvent(state=JobState.succeeded))
