@@ -22,12 +22,15 @@ from splatmill_worker.images.prepare import Prepared, prepare
 from splatmill_worker.sfm import blocks
 from splatmill_worker.sfm.blocks import Block
 from splatmill_worker.sfm.features import photos_in
-from splatmill_worker.sfm.mapping import apart, clusters
+from splatmill_worker.sfm.mapping import clusters
 
 pytestmark = pytest.mark.slow
 
 COUNT = 16
 OPTIONS = sfm.SfmOptions(stereo=False)
+
+PARTS = "part 1 of 2, photos placed", "part 2 of 2, photos placed"
+"""Notes of the progress while two clusters are mapped."""
 
 
 def silent(stage: str, done: int, total: int, note: str) -> None:
@@ -156,11 +159,11 @@ def test_clusters_mapped_in_blocks_are_those_of_one_process(
             tmp_path / "whole",
             OPTIONS,
             lambda stage, done, total, note: stages.append((stage, note)),
-            lambda: stages[-1][0] == "mapping" and "part" not in stages[-1][1],
+            lambda: (
+                stages[-1][0] == "mapping" and stages[-1][1] not in (*PARTS, "dividing the photos into parts")
+            ),
         )
-    assert {note for stage, note in stages if stage == "mapping"} >= {
-        *("photos placed, part 1 of 2", "photos placed, part 2 of 2")
-    }
+    assert {note for stage, note in stages if stage == "mapping"} >= {*PARTS}
     before, work = in_blocks(prepared, tmp_path, 3, 2 if lost == "features" else None)
     if lost == "matches":
         before = [part for part in before if part.name != "matches-2"]
@@ -168,16 +171,21 @@ def test_clusters_mapped_in_blocks_are_those_of_one_process(
     for number in (1, 2, 3):
         part = tmp_path / f"mapping-{number}"
         placed = blocks.map_block(prepared, part, OPTIONS, Block(number, 3), before, silent, never)
+        if lost == "matches":
+            assert placed == 0, "one process finds them, and maps the clusters"
+            assert not [path for path in part.rglob("*") if path.is_file()]
+            continue
         assert (placed > 0) == (number < 3), "two clusters"
         left = {path.relative_to(part).parts[3] for path in part.rglob("*") if path.is_file()}
-        assert left == ({"apart"} if number < 3 else set()), "nothing else is kept"
+        assert left == ({"clusters"} if number < 3 else set()), "nothing else is kept"
         parts.append(part)
+    if lost == "matches":
+        return
     blocks.merge(parts, work, lambda done, total: None, never)
-    for number in (0, 1):
-        ours, theirs = (apart.folder_of(database_in(folder), number) for folder in (work, tmp_path / "whole"))
-        assert files_below(ours) == files_below(theirs) != set()
-        for name in files_below(ours):
-            assert (ours / name).read_bytes() == (theirs / name).read_bytes(), name
+    ours, theirs = (database_in(folder).with_name("clusters") for folder in (work, tmp_path / "whole"))
+    assert files_below(ours) == files_below(theirs) != set()
+    for name in files_below(ours):
+        assert (ours / name).read_bytes() == (theirs / name).read_bytes(), name
     stages.clear()
     with suppress(sfm.SfmFailed, Cancelled):
         sfm.reconstruct_photos(
@@ -185,12 +193,9 @@ def test_clusters_mapped_in_blocks_are_those_of_one_process(
             work,
             OPTIONS,
             lambda stage, done, total, note: stages.append((stage, note)),
-            lambda: bool(stages) and stages[-1][0] == "mapping" and "part" not in stages[-1][1],
+            lambda: bool(stages) and stages[-1] == ("mapping", "photos placed"),
         )
-    assert {note for stage, note in stages if "part" in note} == {
-        *("photos placed, part 1 of 2", "photos placed, part 2 of 2")
-    }, "each is read, not mapped"
-    assert sum("part" in note for _, note in stages) == 2
+    assert [note for _, note in stages if ", photos placed" in note] == [*PARTS], "each is read, not mapped"
 
 
 def test_progress_is_that_of_the_block_and_a_cancelled_one_ends(prepared: Prepared, tmp_path: Path) -> None:

@@ -123,14 +123,19 @@ def test_more_pairs_add_photos_to_a_model_that_has_half_of_them(
 
 
 @pytest.mark.parametrize(
-    ("registered", "alone", "tried"),
-    [(7, [], 1), (7, [8, 9], 1), (7, [6], 2), (6, [], 4)],
+    ("registered", "alone", "tried", "best"),
+    [(7, [], 1, 0), (7, [8, 9], 1, 0), (7, [6], 2, 1), (6, [], 4, 0)],
     ids=["all", "what nothing connects is left", "a connected photo is left", "too few"],
 )
 def test_clusters_that_do_not_join_are_mapped_in_one_piece(
-    registered: int, alone: list[int], tried: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    registered: int,
+    alone: list[int],
+    tried: int,
+    best: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Of ten photos seven are connected."""
+    """Of ten photos seven are connected; the model with more of them is the outcome."""
     chain = [(first, first + 1) for first in range(6)]
     calls: list[tuple[str, int]] = []
 
@@ -140,18 +145,23 @@ def test_clusters_that_do_not_join_are_mapped_in_one_piece(
             images=images, reg_image_ids=lambda: photos, num_reg_images=lambda: len(photos)
         )
 
-    def run(name: mapper.Mapper, *_: object, apart: list[Any] = [], **__: object) -> mapper.Mapped:  # noqa: B006
-        calls.append((name, len(apart)))
-        others = [model(alone)] if alone and apart else []
-        return mapper.Mapped(name, (model([photo for photo in range(7) if photo not in alone]), *others), 0)
+    outcomes: list[mapper.Mapped] = []
+
+    def run(name: mapper.Mapper, *_: object, cluster_models: tuple[Any, ...], **__: object) -> mapper.Mapped:
+        calls.append((name, len(cluster_models)))
+        own = alone if cluster_models else []
+        models = [model([photo for photo in range(registered) if photo not in own]), model(own)]
+        outcomes.append(mapper.Mapped(name, tuple(models[: 1 + bool(own)]), 0))
+        return outcomes[-1]
 
     monkeypatch.setattr(mapper, "run", run)
-    monkeypatch.setattr(trials, "registered_counts", lambda _: (registered, registered))
+    monkeypatch.setattr(trials, "registered_counts", lambda mapped: (mapped.registered, mapped.registered))
     asked: Any = SimpleNamespace(
         options=sfm.SfmOptions(), best_mapper=None, count=10, threads=1, show=None, cancelled=None, on_mapping=None,
         clock=lambda _: nullcontext(),
     )  # fmt: skip
-    trials.best_mapping(asked, tmp_path / "database.db", chain, [model([0, 1, 2, 3]), model([3, 4, 5, 6])])
+    clusters = [model([0, 1, 2, 3]), model([3, 4, 5, 6])]
+    assert trials.best_mapping(asked, tmp_path / "database.db", chain, clusters) is outcomes[best]
     assert calls == [("incremental", 2), ("incremental", 0), ("global", 0), ("incremental", 0)][:tried]
 
 

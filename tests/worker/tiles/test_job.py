@@ -27,6 +27,7 @@ from splatmill.schema import (
 )
 from splatmill_worker import synthetic
 from splatmill_worker.pipeline import Outcome
+from splatmill_worker.sfm.mapping import clusters
 from splatmill_worker.tiles import job
 from splatmill_worker.tiles.folder import PlanFolder
 from splatmill_worker.tiles.stages import Context, run_unit
@@ -147,9 +148,14 @@ def test_units_are_done_in_order_and_stored_and_those_of_others_are_waited_for(t
     assert (again.ended, events) == ("succeeded", [])
 
 
-@pytest.mark.parametrize("failed", [False, True])
-def test_features_and_matches_of_others_are_waited_for_and_used(tmp_path: Path, failed: bool) -> None:
-    """Until the cameras are there. failed: the features that others have, which later units find then."""
+@pytest.mark.parametrize(("failed", "mapped"), [(False, False), (True, False), (False, True)])
+def test_features_and_matches_of_others_are_waited_for_and_used(
+    tmp_path: Path, failed: bool, mapped: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Until the cameras are there. failed: the features that others have, which later units find then. mapped: the
+    photos have clusters."""
+    if mapped:
+        monkeypatch.setattr(clusters, "CLUSTER_PHOTOS", 8)
     synthetic.capture(tmp_path / "capture" / "images", 16, 240, 180, samples=1)
 
     class Has(Play):
@@ -161,11 +167,13 @@ def test_features_and_matches_of_others_are_waited_for_and_used(tmp_path: Path, 
                     else:
                         run_unit(Context(folder, run, lambda event: None, lambda: False))
 
-    others = Has(lambda folder: None, *(("features-2",) if failed else ("features-2", "matches-2")))
+    theirs = ["features-2", *([] if failed else ["matches-2"]), *(["mapping-2"] if mapped else [])]
+    others = Has(lambda folder: None, *theirs)
     outcome, events = run(tmp_path, others, lambda events: "cameras" in others.stores)
     assert outcome.ended == "cancelled"
     matches = [] if failed else ["matches-1", "matches-2"]  # what failed is not known elsewhere
-    assert others.offered == ["features-1", "features-2", *matches]
+    mapping = ["mapping-1", "mapping-2"] if mapped else []
+    assert others.offered == ["features-1", "features-2", *matches, *mapping]
     told = [(event.unit, event.state) for event in events if isinstance(event, UnitEvent)]
     both, last = ("running", "done"), "running" if failed else "elsewhere"
     assert told == [
@@ -173,11 +181,18 @@ def test_features_and_matches_of_others_are_waited_for_and_used(tmp_path: Path, 
         *(("features-2", state) for state in ("elsewhere", "failed" if failed else "done")),
         *((unit, state) for unit in ("pairs", "matches-1") for state in both),
         *(("matches-2", state) for state in (last, "done")),
+        *(("mapping-1", state) for state in both if mapped),
+        *(("mapping-2", state) for state in ("elsewhere", "done") if mapped),
         *(("cameras", state) for state in both),
     ]
     progress = [event for event in events if isinstance(event, ProgressEvent)]
     waits = [(event.stage, event.done, event.total) for event in progress if "waiting" in (event.note or "")]
-    assert waits == [(stage, 2, 2) for stage in (("features",) if failed else ("features", "matching"))]
+    assert waits == [
+        (stage, 2, 2)
+        for stage in ("features", *([] if failed else ["matching"]), *(["mapping"] if mapped else []))
+    ]
+    if mapped:
+        assert "mapping 1 of 2: part 1 of 2, photos placed" in {event.note for event in progress}
     assert "features 1 of 2: still_0001.jpg" in {event.note for event in progress}
     assert sum(event.stage == "images" and event.note == "still_0001.jpg" for event in progress) == 1
     parts = ("features", "matches", "mapping")

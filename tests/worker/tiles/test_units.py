@@ -77,6 +77,16 @@ def test_what_only_the_cameras_need_is_not_done_once_they_are_there() -> None:
     assert scene.key("cameras", failed) == scene.key("cameras", {})
 
 
+@pytest.mark.parametrize(
+    ("clusters", "mapper", "left"), [(0, "auto", 4), (3, "auto", 1), (9, "auto", 0), (3, "global", 4)]
+)
+def test_mapping_units_without_a_cluster_are_left_out(clusters: int, mapper: str, left: int) -> None:
+    scene = plan(4, mapper=mapper)
+    facts = {"photos": 250 * clusters, "divided": True, "clusters": clusters}
+    assert scene.left_out(facts) == set(scene.mapping_names[4 - left :])
+    assert scene.left_out(facts | {"divided": False}) == set(scene.camera_names[1:-1])
+
+
 def test_options_that_cameras_follow_from_exist_and_a_plan_survives_json() -> None:
     assert set(CAMERA_OPTIONS) <= set(TrainOptions.model_fields)
     scene = plan(7, steps=300, holdout=5)

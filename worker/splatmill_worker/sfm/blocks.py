@@ -28,7 +28,7 @@ from splatmill_worker.sfm.effort import (
     select_pairs,
 )
 from splatmill_worker.sfm.features import FEATURES, completed, merge_databases, pairs_in, photos_in
-from splatmill_worker.sfm.mapping.apart import APART, stored_models
+from splatmill_worker.sfm.mapping.cluster_models import CLUSTERS
 from splatmill_worker.sfm.options import SfmOptions
 from splatmill_worker.sfm.run import SFM, EffortResult, SfmRun, opened
 from splatmill_worker.sfm.solve import efforts
@@ -137,10 +137,11 @@ def map_block(
     on_progress: OnProgress,
     cancelled: Callable[[], bool],
 ) -> int:
-    """Map a block of the clusters, and keep their models alone; returns the number of photos that they place.
+    """Map a part of the clusters, and keep only their models; returns the number of photos that these place.
 
-    before: work folders with the features of all blocks, the scores, and the matches of all blocks. What they lack is
-        found.
+    block: of `block.blocks` clusters in a row, that of `block.number`; and so on for the next ones.
+    before: work folders with the features of all blocks, the scores, and the matches of all blocks. Where matches lack,
+        nothing is mapped: they are found once, by `reconstruct_photos`.
 
     Raises Cancelled.
     """
@@ -148,22 +149,15 @@ def map_block(
     with opened(prepared, workdir, options, on_progress, cancelled) as run:
         result = _first_effort(run)
         chosen = select_pairs(run, result)  # by the scores, without any features
-        lost = chosen - pairs_in(result.database)
-        if lost:  # with the block of photos or of pairs that they were in
-            merge(before, workdir, _merging("mapping", on_progress), cancelled)
-        find_features(run, result, None if lost else ())
-        with closing(pycolmap.Database.open(result.database)) as database:
-            match(run, result, chosen, database)
-        clusters = map_clusters(run, result, lambda count: range(block.number - 1, count, block.blocks))
-        placed = {
-            image
-            for number in clusters
-            for model in stored_models(result.database, number)
-            for image in model.reg_image_ids()
-        }
+        models: list[pycolmap.Reconstruction] = []
+        if chosen <= pairs_in(result.database):
+            find_features(run, result, ())
+            with closing(pycolmap.Database.open(result.database)) as database:
+                match(run, result, chosen, database)
+            models = map_clusters(run, result, lambda count: range(block.number - 1, count, block.blocks))
     result.database.unlink()
     result.database.with_name(SCORES).unlink(missing_ok=True)
-    return len(placed)
+    return len({image for model in models for image in model.reg_image_ids()})
 
 
 def _first_effort(run: SfmRun) -> EffortResult:
@@ -200,6 +194,6 @@ def merge(
             target = workdir / source.relative_to(part)
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(source, target)
-        for models in sorted((part / SFM).glob(f"*/*/{APART}/*")):
+        for models in sorted((part / SFM).glob(f"*/*/{CLUSTERS}/*")):
             shutil.copytree(models, workdir / models.relative_to(part), dirs_exist_ok=True)
         on_progress(number, len(parts))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +14,8 @@ from splatmill_worker.colmap import pycolmap
 from splatmill_worker.errors import SfmFailed
 from splatmill_worker.opencv import VERSION as OPENCV_VERSION
 from splatmill_worker.sfm import features
-from splatmill_worker.sfm.mapping import apart, mapper
+from splatmill_worker.sfm.mapping import mapper
+from splatmill_worker.sfm.mapping.cluster_models import mapped_cluster
 from splatmill_worker.sfm.mapping.clusters import divide, number_of_clusters
 from splatmill_worker.sfm.mapping.registered import registered
 from splatmill_worker.sfm.matching import pairs, two_view
@@ -59,15 +60,14 @@ def solve_at(run: SfmRun, effort: Effort, earlier: EffortResult | None) -> Effor
         if kept is not None and 2 * kept.registered < run.count:
             kept = None
         # By these pairs alone, as other processes map them.
-        clusters = [] if kept is not None else map_clusters(run, result)
+        cluster_models = [] if kept is not None else map_clusters(run, result)
         _connect(run, result, database)
         if not result.verified:
             return result
         if kept is not None:
             result.mapped = extended_mapping(run, result.database, kept)
         else:
-            models = [model for number in clusters for model in apart.stored_models(result.database, number)]
-            result.mapped = best_mapping(run, result.database, result.verified, models)
+            result.mapped = best_mapping(run, result.database, result.verified, cluster_models)
         left = _unregistered(run, result)
         if left and _match_unregistered(run, result, left, database):
             result.mapped = _mapped_with_more(run, result, result.mapped)
@@ -244,46 +244,53 @@ def match(run: SfmRun, result: EffortResult, chosen: set[pairs.Pair], database: 
         )
 
 
-def clusters_of(count: int, chosen: str) -> int:
-    """In how many clusters `count` photos are mapped, 0 where in none. chosen: the mapper of the options."""
-    return 0 if chosen == "global" else number_of_clusters(count)
-
-
 def map_clusters(
-    run: SfmRun, result: EffortResult, block: Callable[[int], Sequence[int]] = range
-) -> Sequence[int]:
-    """Map the clusters of the photos apart, where these are many; returns their numbers.
+    run: SfmRun, result: EffortResult, chosen: Callable[[int], Iterable[int]] = range
+) -> list[pycolmap.Reconstruction]:
+    """The models of the clusters of the photos, each mapped apart; none where photos are few or another mapper is asked
+    for.
 
-    block: the numbers of those to map, of so many; the others are left out.
+    chosen: the numbers of the clusters to map, by how many there are; all of them if it is left out.
 
-    The models lie beside the database then.
+    The models are stored beside the database. Raises Cancelled.
     """
-    if run.best_mapper == "global" or not clusters_of(run.count, run.options.mapper):
-        return ()
-    inliers = {pair: result.matched[pair].inliers for pair in result.verified}
-    clusters = divide(run.count, inliers)
-    chosen = block(len(clusters))
-    photos, placed = sum(len(clusters[number]) for number in chosen), 0
+    if "global" in (run.options.mapper, run.best_mapper) or not number_of_clusters(run.count):
+        return []
+    models: list[pycolmap.Reconstruction] = []
+    largest = 2
+
+    def show(model: pycolmap.Reconstruction) -> None:
+        nonlocal largest
+        if (
+            model.num_reg_images() > largest
+        ):  # each has a world of its own, from one of which onlookers see all
+            largest = model.num_reg_images()
+            run.show(model)
+
     with run.clock("mapping"):
-        for number in chosen:
-            images = [result.ids[index] for index in clusters[number]]
-            words = f"photos placed, part {number + 1} of {len(clusters)}"
+        run.on_mapping(0, run.count, "dividing the photos into parts")
+        inliers = {pair: result.matched[pair].inliers for pair in result.verified}
+        clusters = divide(run.count, inliers, run.cancelled)
+        numbers = list(chosen(len(clusters)))
+        total, before = sum(len(clusters[number]) for number in numbers), 0
+        for number in numbers:
+            words = f"part {number + 1} of {len(clusters)}, photos placed"
 
-            def report(done: int, before: int = placed, words: str = words) -> None:
-                run.on_mapping(before + done, photos, words)
+            def report(placed: int, before: int = before, words: str = words) -> None:
+                # Some photos are in several clusters.
+                run.on_mapping(run.count * (before + placed) // total, run.count, words)
 
-            apart.map_cluster(
+            models += mapped_cluster(
                 result.database,
-                number,
-                images,
+                [result.ids[index] for index in clusters[number]],
                 run.threads,
                 run.options.seed,
                 on_progress=report,
-                on_model=run.show,
+                on_model=show,
                 cancelled=run.cancelled,
             )
-            placed += len(images)
-    return chosen
+            before += len(clusters[number])
+    return models
 
 
 def _connect(run: SfmRun, result: EffortResult, database: pycolmap.Database) -> None:

@@ -25,7 +25,7 @@ from splatmill_worker.sfm.options import Effort, SfmOptions
 from splatmill_worker.sfm.placed import PlacingObserver, placed
 from splatmill_worker.sfm.sift import Features
 
-VERSION = 10
+VERSION = 11
 """Version of everything that is cached; a cache with another version is not read."""
 
 SFM = "sfm"

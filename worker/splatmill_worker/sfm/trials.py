@@ -15,6 +15,11 @@ ENOUGH_REGISTERED = 0.9
 """Share of the photos that the view graph connects, reliably registered, from which no other mapper is tried."""
 
 
+SEPARATE = 0.01
+"""Share of the photos that the view graph connects, left in separate models when clusters were joined, above which they
+are mapped in one piece as well (decisions: clusters)."""
+
+
 def registered_counts(mapped: mapper.Mapped | None) -> tuple[int, int]:
     """Number of photos registered reliably in the largest model, and number of all those registered in it."""
     if mapped is None:
@@ -26,12 +31,12 @@ def best_mapping(
     run: SfmRun,
     database: Path,
     verified: Collection[pairs.Pair],
-    apart: Sequence[pycolmap.Reconstruction] = (),
+    cluster_models: Sequence[pycolmap.Reconstruction] = (),
 ) -> mapper.Mapped:
     """The best of up to three mappings: with the incremental mapper, with the global one, and with relaxed settings.
 
-    Before them, the models of clusters `apart` are joined, where there are any. They are enough only where none of the
-    photos that are connected is left in a model of its own: one mapping may place them with the others.
+    Before them, `cluster_models` are joined, where there are any. That is enough only where at most SEPARATE of the
+    photos that are connected are left in models of their own: one mapping may place them with the others.
 
     The global one is the first where `mapper` asks for it, and where it registered more photos at an earlier effort
     (decisions: first-mapper).
@@ -49,7 +54,7 @@ def best_mapping(
     elif run.best_mapper is not None:
         first = run.best_mapper
     trials: list[tuple[mapper.Mapper, bool]] = [(first, False)]
-    if apart:
+    if cluster_models:
         trials.insert(0, ("incremental", False))
     if asked == "auto":
         trials.append(("global" if first == "incremental" else "incremental", False))
@@ -66,7 +71,7 @@ def best_mapping(
                 run.threads,
                 run.options.seed,
                 relaxed=relaxed,
-                apart=apart if number == 0 else (),
+                cluster_models=cluster_models if number == 0 else (),
                 on_progress=run.on_mapping,
                 on_model=run.show,
                 cancelled=run.cancelled,
@@ -74,15 +79,15 @@ def best_mapping(
             rank = registered_counts(mapped)
             if best is None or rank > best_rank:
                 best, best_rank = mapped, rank
-            left_apart = apart and number == 0 and connected & _left_apart(mapped)
-            if best_rank[0] >= ENOUGH_REGISTERED * len(connected) and not left_apart:
+            separate = len(connected & _separate(mapped)) if cluster_models and number == 0 else 0
+            if best_rank[0] >= ENOUGH_REGISTERED * len(connected) and separate <= SEPARATE * len(connected):
                 break
     assert best is not None  # there is at least one trial
     run.best_mapper = best.mapper
     return best
 
 
-def _left_apart(mapped: mapper.Mapped) -> set[int]:
+def _separate(mapped: mapper.Mapped) -> set[int]:
     """Indices of the photos that other models than the largest have placed alone."""
     first, *others = ({photo_index(m.images[i].name) for i in m.reg_image_ids()} for m in mapped.models)
     return set().union(*others) - first

@@ -2,7 +2,7 @@
 may overlap, the matches of a block of pairs, and the mapping of a block of clusters.
 
 They are left out, and the unit `cameras` does all of it, where the cameras are given or known, or where photos lie in
-zips and videos, which each of them would have to unpack. Of the mapping, those are that have no cluster.
+zips and videos, which each of them would have to unpack. Mapping units without a cluster are left out too.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from splatmill_worker.pipeline.capture import photos_without_cameras, sfm_option
 from splatmill_worker.pipeline.events import progress_events
 from splatmill_worker.pipeline.job import Job
 from splatmill_worker.sfm import blocks
-from splatmill_worker.sfm.effort import clusters_of
+from splatmill_worker.sfm.mapping.clusters import number_of_clusters
 from splatmill_worker.sfm.run import SFM
 from splatmill_worker.sfm.solve import has_model
 from splatmill_worker.tiles.folder import facts_of
@@ -41,7 +41,7 @@ def examine_photos(job: Job, out: Path) -> dict[str, Any]:
     return {
         "photos": count,
         DIVIDED: count >= MIN_PHOTOS and not known,
-        CLUSTERS: clusters_of(count, job.options.mapper),
+        CLUSTERS: number_of_clusters(count),
     }
 
 
@@ -102,8 +102,6 @@ def do_part(
         facts = {"photos": blocks.find_block(prepared, job.workdir, options, block, report, stop)}
     elif kind == "mapping":
         block = block_of(name, parts)
-        if block.number > facts_of(photos)[CLUSTERS]:
-            return {}
         facts = {"photos": blocks.map_block(prepared, job.workdir, options, block, others, report, stop)}
     else:
         block = block_of(name, parts)

@@ -310,7 +310,8 @@ def _link_scene(root: Path, path: Path) -> None:
 
 
 def _left_out(folder: PlanFolder) -> set[str]:
-    """The units that the scene does not need: those before the cameras, where these are given or there already."""
+    """The units that the scene does not need: those before the cameras, where these are given or there already, and
+    mapping units without a cluster."""
     ended, states = folder.ended(), folder.states()
     photos = ended.get("photos")
     names = {unit.name for unit in folder.plan.units} - folder.plan.pending(states) - set(ended)

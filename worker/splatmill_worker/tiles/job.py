@@ -312,6 +312,8 @@ class _Events:
         self._work, self._name, self._folder = work, name, folder
         plan = work.folder.plan
         several = plan.blocks if name in plan.camera_names else plan.tiles
+        if name in plan.mapping_names:
+            several -= len(set(plan.mapping_names).intersection(work.left_out))
         self._label = {"coarse": "coarse model", "scene": "whole scene"}.get(
             name, f"{name.replace('-', ' ')} of {several}"
         )

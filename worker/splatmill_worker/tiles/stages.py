@@ -136,6 +136,8 @@ def _before_cameras(context: Context) -> dict[str, Any]:
         return camera_parts.examine_photos(job, out)
     known = None if context.known is None else context.known.parent
     before = context.outputs(*plan.unit(name).needs)
+    if name in plan.left_out(facts_of(before[0])):
+        return {}
     return camera_parts.do_part(job, name, plan.blocks, before, out, known)
 
 

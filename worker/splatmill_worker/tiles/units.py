@@ -27,7 +27,7 @@ DIVIDED = "divided"
 """Fact of the unit `photos`: whether the units between it and the cameras have something to do."""
 
 CLUSTERS = "clusters"
-"""Fact of the unit `photos`: the number of clusters in which the photos are mapped."""
+"""Fact of the unit `photos`: the number of clusters of photos, which the incremental mapper maps apart."""
 
 MOST_BLOCKS = 64
 """Blocks of photos, of their pairs and of their clusters, at most: more machines do not find the cameras together."""
@@ -169,7 +169,8 @@ class ScenePlan:
         """
         if not photos.get(DIVIDED, True):
             return set(self.camera_names[1:-1])
-        return set(self.mapping_names[photos.get(CLUSTERS, 0) :])
+        clusters = 0 if self.options.mapper == "global" else photos.get(CLUSTERS, 0)
+        return set(self.mapping_names[clusters:])
 
     def depends_on_failures(self, name: str) -> bool:
         """Whether the output of a unit is another one where units before it have failed."""

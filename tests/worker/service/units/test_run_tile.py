@@ -30,6 +30,7 @@ from splatmill_worker.service.units import stored_units
 from splatmill_worker.service.units.run_tile import TileEntry, run_tile
 from splatmill_worker.service.units.stored_units import StoredUnits
 from splatmill_worker.sfm.features import photos_in
+from splatmill_worker.sfm.mapping import clusters
 from splatmill_worker.tiles.folder import PlanFolder, facts_of
 from splatmill_worker.tiles.stages import Context, run_unit
 from splatmill_worker.tiles.units import ScenePlan
@@ -145,6 +146,7 @@ def test_features_and_matches_are_found_on_another_machine_with_the_photos_of_th
     write_row(connection, JOB, options=options, capture="capture2")
     capture = tmp_path / "capture"
     synthetic.capture(capture / "images", 5, 160, 120, samples=1)
+    monkeypatch.setattr(clusters, "CLUSTER_PHOTOS", 2)
     names = sorted(path.name for path in (capture / "images").iterdir())
     masks = [f"{Path(name).stem}.png" for name in names]
     (capture / "masks").mkdir()
@@ -194,6 +196,13 @@ def test_features_and_matches_are_found_on_another_machine_with_the_photos_of_th
     assert database("matches-1").relative_to(made.output("matches-1")) == database("features-2").relative_to(
         made.output("features-2")
     )
+    elsewhere("mapping-1")
+    here("mapping-2")
+    assert not (folder / "capture").exists(), "mapping needs no photo"
+    for name in ("mapping-1", "mapping-2"):
+        output = made.ended()[name].path
+        assert output is not None
+        assert facts_of(output)["photos"] == 0, "that these small photos are not placed by"
     with made.claimed("cameras") as run:  # that these small photos do not have
         run.publish({})
     units.put(made.output("cameras"))

@@ -9,8 +9,10 @@ same clusters.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from heapq import heapify, heappop, heappush
+
+from splatmill_worker.sfm.callbacks import stop_if
 
 CLUSTER_PHOTOS = 250
 """Photos of a cluster, without those that it shares. From twice as many photos on, a capture has clusters (decisions:
@@ -20,7 +22,7 @@ SHARED = 0.125
 """Photos of its neighbours that a cluster has too, over its own."""
 
 STARTS = 16
-"""Photos from which a part is grown, of which the best one is kept."""
+"""Photos, or up to twice as many, from which a part is grown; the best one is kept."""
 
 FRUITLESS = 100
 """Swaps in a row without a better cut, after which no more are tried."""
@@ -35,29 +37,35 @@ def number_of_clusters(count: int) -> int:
     return clusters if clusters > 1 else 0
 
 
-def divide(count: int, inliers: Mapping[tuple[int, int], int]) -> list[list[int]]:
+def divide(
+    count: int, inliers: Mapping[tuple[int, int], int], cancelled: Callable[[], bool]
+) -> list[list[int]]:
     """The photos of each cluster, in ascending order.
 
     count: number of photos, enough for several clusters.
     inliers: of each pair of photos, by their indices.
+
+    Raises Cancelled, when `cancelled` returns true.
     """
     graph: list[dict[int, int]] = [{} for _ in range(count)]
     for (first, second), weight in inliers.items():
         graph[first][second] = graph[second][first] = weight
-    parts = _parts(graph, set(range(count)), number_of_clusters(count))
+    parts = _parts(graph, set(range(count)), number_of_clusters(count), cancelled)
     return [sorted(part | _neighbours(graph, part)) for part in parts]
 
 
-def _parts(graph: Graph, photos: set[int], number: int) -> list[set[int]]:
+def _parts(graph: Graph, photos: set[int], number: int, cancelled: Callable[[], bool]) -> list[set[int]]:
     """The photos in so many parts of equal size."""
     if number == 1:
         return [photos]
     first = number // 2
     size = len(photos) * first // number
-    starts = sorted(photos)[:: max(1, len(photos) // STARTS)]
-    candidates = [_improved(graph, photos, _grown(graph, photos, start, size)) for start in starts]
+    candidates = []
+    for start in sorted(photos)[:: max(1, len(photos) // STARTS)]:
+        stop_if(cancelled)
+        candidates.append(_improved(graph, photos, _grown(graph, photos, start, size)))
     part = min(candidates, key=lambda each: _cut(graph, each, photos - each))
-    return _parts(graph, part, first) + _parts(graph, photos - part, number - first)
+    return _parts(graph, part, first, cancelled) + _parts(graph, photos - part, number - first, cancelled)
 
 
 class _Side:
@@ -73,12 +81,13 @@ class _Side:
         self._heap: list[tuple[int, int]] = []
 
     def consider_all(self) -> None:
-        """Let `moved` choose among all photos. Without, it does among those whose gain has changed."""
+        """Let `pop_best` choose among all photos. Without, it does among those whose gain has changed."""
         self._heap = [(-gain, photo) for photo, gain in self.gains.items()]
         heapify(self._heap)
 
-    def moved(self, other_side: _Side | None = None) -> tuple[int, int] | None:
-        """Take the photo by which the cut loses the most from this side; returns it and what the cut loses."""
+    def pop_best(self, other_side: _Side | None = None) -> tuple[int, int] | None:
+        """Take the photo from this side by which the cut loses the most; returns it and what the cut loses, None where
+        there is no photo to choose."""
         while self._heap:
             gain, photo = heappop(self._heap)
             if self.gains.get(photo) == -gain:
@@ -106,7 +115,7 @@ def _grown(graph: Graph, photos: set[int], start: int, size: int) -> set[int]:
     left.take(start)
     grown = {start}
     while len(grown) < size:
-        best = left.moved()
+        best = left.pop_best()
         if best is None:  # nothing that is left is connected with the part
             best = min(left.gains), 0
             left.take(best[0])
@@ -125,8 +134,8 @@ def _improved(graph: Graph, photos: set[int], part: set[int]) -> set[int]:
         swaps: list[tuple[int, int]] = []
         gained = best = kept = 0
         while len(swaps) < kept + FRUITLESS:
-            leaves = ours.moved(theirs)
-            joins = theirs.moved(ours)
+            leaves = ours.pop_best(theirs)
+            joins = theirs.pop_best(ours)
             if leaves is None or joins is None:
                 break
             swaps.append((leaves[0], joins[0]))

@@ -62,7 +62,7 @@ def run(
     *,
     relaxed: bool = False,
     fixed_intrinsics: bool = False,
-    apart: Sequence[pycolmap.Reconstruction] = (),
+    cluster_models: Sequence[pycolmap.Reconstruction] = (),
     on_progress: Callable[[int, int, str], None],
     on_model: Callable[[pycolmap.Reconstruction], None] = lambda _: None,
     cancelled: Callable[[], bool],
@@ -71,8 +71,8 @@ def run(
 
     relaxed: accept smaller triangulation angles and fewer inliers (incremental mapper only).
     fixed_intrinsics: keep focal lengths and distortion as they are in the database.
-    apart: models of clusters of the photos (`models_of`), which the incremental mapper joins and completes. Without
-        them it begins with a first pair.
+    cluster_models: models of clusters of the photos (`models_of`), which the incremental mapper joins and completes.
+        Without them it begins with a first pair.
     on_progress: called as (photos placed, count, note) after each step of the incremental mapper; by the global one,
         which places all photos at once, every few seconds.
     on_model: called with the model that grows, after each step of the incremental mapper, which waits meanwhile.
@@ -86,8 +86,11 @@ def run(
         if mapper == "incremental":
             options = _incremental_options(threads, seed, relaxed, fixed_intrinsics)
             mapping = IncrementalMapping(database, options, _Steps(count, on_progress, on_model), cancelled)
-            if apart:
-                models, before, joined_notes = merge_models(sorted(apart, key=_size))
+            if cluster_models:
+                placed = len({image for model in cluster_models for image in model.reg_image_ids()})
+                on_progress(placed, count, f"{len(cluster_models)} parts of the model are joined")
+                models, before, joined_notes = merge_models(sorted(cluster_models, key=_size))
+                stop_if(cancelled)
                 mapping.joined(models[0])
             else:
                 models = sorted(mapping.models(), key=_size)
