@@ -536,6 +536,8 @@ def test_the_units_of_a_scene_in_tiles_are_counted_by_kind(page: Page) -> None:
         ["Pairs of photos", "", "yes", "", ""],
         ["Cameras", "", "", "", ""],
     ]
+    mapped = [{"unit": "mapping-1", "state": "running"}, {"unit": "mapping-2", "state": "elsewhere"}]
+    assert page.evaluate(rows, mapped)[1] == ["Parts of the mapping", "0", "1; 2 on other workers", "", ""]
 
 
 @pytest.mark.parametrize(
