@@ -8,7 +8,6 @@ cameras of many photos are: `bench ground` measures that.
 from __future__ import annotations
 
 import random
-from contextlib import closing
 from itertools import chain, pairwise
 from pathlib import Path
 
@@ -18,6 +17,7 @@ import pytest
 from splatmill_worker.colmap import pycolmap, write_model
 from splatmill_worker.errors import Cancelled
 from splatmill_worker.sfm.mapping import cluster_models, clusters, mapper
+from tests.support.scenes.synthesized import synthesized
 
 PHOTOS = 24
 
@@ -102,12 +102,7 @@ def test_photos_without_matches_are_in_some_cluster(monkeypatch: pytest.MonkeyPa
 def scene(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, pycolmap.Reconstruction]:
     """A database with the matches of PHOTOS photos, and their true poses."""
     path = tmp_path_factory.mktemp("clusters") / "database.db"
-    options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs = options.num_cameras_per_rig = 1
-    options.num_frames_per_rig, options.num_points3D = PHOTOS, 300
-    pycolmap.set_random_seed(0)
-    with closing(pycolmap.Database.open(path)) as database:
-        return path, pycolmap.synthesize_dataset(options, database)
+    return path, synthesized(path, PHOTOS)
 
 
 def mapped_apart(

@@ -14,6 +14,7 @@ from splatmill_worker.colmap import pycolmap
 from splatmill_worker.errors import Cancelled
 from splatmill_worker.sfm.features import copy_without_pairs
 from splatmill_worker.sfm.mapping import adjust, mapper
+from tests.support.scenes.synthesized import synthesized
 
 PHOTOS = 24
 
@@ -22,15 +23,7 @@ PHOTOS = 24
 def scene(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, pycolmap.Reconstruction]:
     """A database with the matches of PHOTOS photos, and their true poses."""
     path = tmp_path_factory.mktemp("incremental") / "database.db"
-    options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs = options.num_cameras_per_rig = 1
-    options.num_frames_per_rig, options.num_points3D = PHOTOS, 300
-    pycolmap.set_random_seed(0)
-    database = pycolmap.Database.open(path)
-    try:
-        return path, pycolmap.synthesize_dataset(options, database)
-    finally:
-        database.close()
+    return path, synthesized(path, PHOTOS)
 
 
 def require_true(model: pycolmap.Reconstruction, truth: pycolmap.Reconstruction) -> None:
