@@ -27,7 +27,7 @@ from splatmill_worker.sfm.mapping import clusters
 pytestmark = pytest.mark.slow
 
 COUNT = 16
-OPTIONS = sfm.SfmOptions(stereo=False)
+OPTIONS = sfm.SfmOptions(stereo=False, threads=1)  # of several, the order of the sums is by chance
 
 PARTS = "part 1 of 2, photos placed", "part 2 of 2, photos placed"
 """Notes of the progress while two clusters are mapped."""

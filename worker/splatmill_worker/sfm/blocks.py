@@ -139,7 +139,7 @@ def map_block(
 ) -> int:
     """Map a part of the clusters, and keep only their models; returns the number of photos that these place.
 
-    block: of `block.blocks` clusters in a row, that of `block.number`; and so on for the next ones.
+    block: the clusters `block.number`, `block.number + block.blocks` and so on, counted from 1.
     before: work folders with the features of all blocks, the scores, and the matches of all blocks. Where matches lack,
         nothing is mapped: they are found once, by `reconstruct_photos`.
 

@@ -261,9 +261,8 @@ def map_clusters(
 
     def show(model: pycolmap.Reconstruction) -> None:
         nonlocal largest
-        if (
-            model.num_reg_images() > largest
-        ):  # each has a world of its own, from one of which onlookers see all
+        # Each has a world of its own: a smaller one after a larger one would be another picture.
+        if model.num_reg_images() > largest:
             largest = model.num_reg_images()
             run.show(model)
 
@@ -273,12 +272,12 @@ def map_clusters(
         clusters = divide(run.count, inliers, run.cancelled)
         numbers = list(chosen(len(clusters)))
         total, before = sum(len(clusters[number]) for number in numbers), 0
+        count = run.count if len(numbers) == len(clusters) else total  # some photos are in several clusters
         for number in numbers:
             words = f"part {number + 1} of {len(clusters)}, photos placed"
 
             def report(placed: int, before: int = before, words: str = words) -> None:
-                # Some photos are in several clusters.
-                run.on_mapping(run.count * (before + placed) // total, run.count, words)
+                run.on_mapping(count * (before + placed) // total, count, words)
 
             models += mapped_cluster(
                 result.database,
