@@ -29,7 +29,7 @@ from splatmill_worker.kernels.gpu.device import absence
 from splatmill_worker.splat.formats import registry
 from splatmill_worker.splat.gaussians import concatenate
 from splatmill_worker.splat.plan.rates import RateSchedule, boost_of
-from splatmill_worker.tiles import coarse_model, command, joined
+from splatmill_worker.tiles import coarse_model, command, joined, tile
 from splatmill_worker.tiles.folder import DONE, PlanFolder, facts_of
 from splatmill_worker.tiles.tile import tile_plan
 from tests.support import still_life
@@ -112,7 +112,7 @@ def test_the_scene_is_as_good_as_in_one_piece(whole: Path, tmp_path: Path) -> No
     assert min(facts[f"seam-{number}"]["gaussians"] for number in (1, 2)) > 200
 
 
-def test_a_tile_goes_on_where_the_coarse_model_stopped(whole: Path) -> None:
+def test_a_tile_goes_on_where_the_coarse_model_stopped(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = PlanFolder.open(whole).ended()["coarse"].path
     assert path is not None
     coarse = coarse_model.read(path)
@@ -144,6 +144,9 @@ def test_a_tile_goes_on_where_the_coarse_model_stopped(whole: Path) -> None:
     late = replace(plan.schedule, dropout=0.2, earlier_visits=150.0)
     assert late.left_out(0.0) == pytest.approx(0.1)
     assert late.left_out(50.0) == pytest.approx(0.2)
+    monkeypatch.setattr(tile, "COARSE_SHARE", 0.25)  # the tiles take what the coarse training leaves
+    budgets = [tile_plan(coarse, 500, 11, last=last).schedule.budget.steps for last in (False, True)]
+    assert budgets == [240, 60]
 
 
 def test_a_tile_adds_gaussians_for_as_long_as_one_piece_or_as_a_limit_stopped_the_coarse_training(
