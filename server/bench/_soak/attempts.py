@@ -29,6 +29,20 @@ def got_on(lines: Iterable[Line], moment: float) -> dict[str, float]:
     return moments
 
 
+def busy_with_others(lines: Iterable[Line], moment: float, jobs: Collection[str]) -> float:
+    """Return for how many seconds after a moment attempts at other jobs than these ran.
+
+    An attempt that was killed counts up to its last line. The soak has one worker, so no two attempts run at once.
+    """
+    began: dict[int, float] = {}
+    last: dict[int, float] = {}
+    for line in lines:
+        if line["job"] not in jobs and line["at"] > moment:
+            began.setdefault(line["pid"], line["at"])
+            last[line["pid"]] = line["at"]
+    return sum(last[pid] - began[pid] for pid in began)
+
+
 def overlapping(lines: Iterable[Line]) -> list[str]:
     """Return a sentence for each attempt that began while another at the same job ran."""
     return [

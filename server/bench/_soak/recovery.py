@@ -11,7 +11,8 @@ from _soak.orphans import command
 from _soak.service import Service
 
 RESUME_SECONDS = 30.0
-"""Seconds after a fault within which all of it works again, times the patience of the soak."""
+"""Seconds after a fault within which all of it works again, times the patience of the soak. Those in which the worker
+trained other jobs do not count for a job that waits for it."""
 
 _PAUSE = 0.02  # seconds between two looks
 
@@ -40,19 +41,23 @@ def recover(
         "shows": lambda: shows(service, clients),
         "resumes": lambda: resumed(service, clients, struck, healed),
     }
-    while len(seconds) < len(waited) and time.monotonic() < healed + within:
+    limits = dict.fromkeys(waited, within)
+    while len(seconds) < len(waited) and time.monotonic() < healed + max(limits.values()):
         for what in [what for what in waited if what not in seconds]:
             if (when := waited[what]()) is not False:
                 seconds[what] = (time.monotonic() if when is True else when) - healed
+        if seconds.get("resumes", time.monotonic() - healed) >= within:
+            begun = interrupted(service, clients, struck)
+            limits["resumes"] = within + attempts.busy_with_others(service.records(), healed, begun)
         time.sleep(_PAUSE)
     orphans = service.orphans()
     while orphans and time.monotonic() < healed + within:
         time.sleep(_PAUSE)
         orphans = service.orphans()
-    late = [what for what in waited if seconds.get(what, within) >= within]
+    late = [what for what, limit in limits.items() if seconds.get(what, limit) >= limit]
     complaint = None
     if late:
-        complaint = f"After {within:g} s the service does not do this: {', '.join(late)}."
+        complaint = f"After {max(limits[what] for what in late):.0f} s the service does not do this: {', '.join(late)}."
         if "resumes" in late:
             waiting = missing(service, clients, struck, healed)
             complaint += f" It has not resumed {sorted(waiting) or 'any job'}."

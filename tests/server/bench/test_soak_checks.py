@@ -77,6 +77,19 @@ def test_a_job_that_only_begins_again_has_not_got_on() -> None:
     assert attempts.got_on([*records, line("end", at=9)], 5) == {"a": 9}
 
 
+def test_a_job_waits_for_as_long_as_the_worker_trains_others() -> None:
+    others = [
+        line("begin", "b", 3) | {"pid": 8},
+        step(1, 9, "b") | {"pid": 8},
+        line("end", "b", 11) | {"pid": 8},
+        line("begin", "c", 12) | {"pid": 9},
+        step(1, 15, "c") | {"pid": 9},  # and then it was killed
+    ]
+    own = [line("begin", at=1), step(1, 2), line("begin", at=20), step(2, 28)]
+    assert attempts.busy_with_others([*own, *others], 5, {"a"}) == (11 - 9) + (15 - 12)
+    assert attempts.busy_with_others(own, 0, {"a"}) == 0
+
+
 def test_attempts_beside_each_other_are_found() -> None:
     assert attempts.overlapping([line("begin"), step(1)]) == []
     assert attempts.overlapping([line("begin", overlap=True)]) == [
