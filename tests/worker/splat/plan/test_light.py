@@ -13,7 +13,7 @@ import torch
 
 from splatmill_worker.scene import PointViews, Scene
 from splatmill_worker.splat.plan.facts import measure
-from splatmill_worker.splat.plan.light import Light, compared
+from splatmill_worker.splat.plan.light import TOGETHER, Light, compared
 from splatmill_worker.splat.plan.observations import Observations
 from splatmill_worker.splat.views import Target, TrainingView
 from splatmill_worker.synthetic import look_at
@@ -91,15 +91,16 @@ def test_planted_exposures_and_tints_are_recovered() -> None:
     assert np.abs(exposures - (log - log.mean(axis=0))).max() < 0.03
 
 
-def test_light_that_follows_the_camera_is_left_in_and_a_jump_is_taken_out() -> None:
-    turns = 2 * np.pi * np.arange(36) / 36
+@pytest.mark.parametrize("photos", [36, 2 * TOGETHER + 1])
+def test_light_that_follows_the_camera_is_left_in_and_a_jump_is_taken_out(photos: int) -> None:
+    turns = 2 * np.pi * np.arange(photos) / photos
     smooth = np.repeat(0.25 * np.cos(turns)[:, None], 3, axis=1)
-    drifting = on_a_ring(36, smooth)
+    drifting = on_a_ring(photos, smooth)
     assert drifting.spread > 0.15
     assert drifting.tail < 0.02
     jump = smooth.copy()
     jump[17] += 0.3
-    departing = on_a_ring(36, jump)
+    departing = on_a_ring(photos, jump)
     assert int(np.abs(departing.departures).max(axis=1).argmax()) == 17
     assert departing.departures[17].mean() == pytest.approx(0.3, abs=0.04)
 

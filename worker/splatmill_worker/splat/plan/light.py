@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,6 +40,9 @@ SMOOTH_REACH = 0.5
 
 SMOOTH_NOISE = 0.01
 """Share, as in SHARES, that goes with it."""
+
+TOGETHER = 500
+"""Photos that predict one another, at most: the time for n grows as n³. More are divided by where they were taken."""
 
 CLEAR = 2.0
 """Standard errors by which the prediction has to be better than a constant: one of many may be so by chance."""
@@ -105,7 +108,8 @@ def compared(observations: Observations, views: Sequence[TrainingView]) -> Light
     predict them. So they are taken out of the exposures, and `departures` has what is left: the error of predicting
     each photo from all others by a Gaussian process over the cameras' positions and directions with a free constant,
     whose reach and noise are those of the least mean error (Rasmussen and Williams 2006, section 5.4.2). The constant
-    alone predicts where that is not clearly worse.
+    alone predicts where that is not clearly worse. Of more than TOGETHER photos, those taken near one another predict
+    one another.
     """
     exposures, errors = _exposures(observations)
     known = np.isfinite(errors)
@@ -116,10 +120,27 @@ def compared(observations: Observations, views: Sequence[TrainingView]) -> Light
     places -= places.mean(axis=0)
     places /= max(float(np.linalg.norm(places, axis=1).max()), 1e-12)
     directions = np.array([camera.viewmat[2, :3] for camera in cameras])
-    apart = _squared_distances(places) + _squared_distances(directions)
+    parts = [
+        (rows, _squared_distances(places[rows]) + _squared_distances(directions[rows]))
+        for rows in _divided(places)
+    ]
     departures = np.zeros_like(exposures)
-    departures[known] = _unpredicted(exposures[known], apart)
-    return Light(exposures, departures, errors, _unseen(apart))
+    departures[known] = _unpredicted(exposures[known], parts)
+    return Light(exposures, departures, errors, _unseen(parts))
+
+
+def _divided(points: Float) -> list[npt.NDArray[np.int64]]:
+    """Rows of points [n, 3] in parts of at most TOGETHER near ones: halved along the axis of the widest spread."""
+    parts, left = list[npt.NDArray[np.int64]](), [np.arange(len(points))]
+    while left:
+        rows = left.pop()
+        if len(rows) <= TOGETHER:
+            parts.append(rows)
+            continue
+        axis = int(np.argmax(points[rows].std(axis=0)))
+        order = rows[np.argsort(points[rows, axis], kind="stable")]
+        left += [order[len(order) // 2 :], order[: len(order) // 2]]
+    return parts
 
 
 def _exposures(observations: Observations) -> tuple[Float, Float]:
@@ -154,34 +175,46 @@ def _exposures(observations: Observations) -> tuple[Float, Float]:
     return exposures, errors
 
 
-def _unpredicted(exposures: Float, apart: Float) -> Float:
-    """What the exposures [n, 3] differ by from those that a smooth function of the other photos' cameras predicts.
+_Part = tuple[npt.NDArray[np.int64], Float]
+"""Photos that predict one another: their rows [n], and the squared distances of their cameras [n, n]."""
 
-    apart: squared distances of the cameras [n, n].
-    """
-    count = len(exposures)
-    brightness = exposures.mean(axis=1)
-    kernels = [(np.zeros((count, count)), 1.0)]  # a constant alone
-    kernels += [(np.exp(-0.5 * apart / reach**2), share) for reach in REACHES for share in SHARES]
-    fits: list[tuple[Float, Float]] = []
-    for kernel, share in kernels:
-        inverse = _precision(kernel, share)
-        left = inverse / np.diag(inverse)[:, None]  # times the values: the error of each from all others
-        fits.append((np.abs(left @ brightness), left @ exposures))
-    (plain, by_constant), (least, rest) = fits[0], min(fits, key=lambda each: float(each[0].mean()))
+
+def _unpredicted(exposures: Float, parts: Sequence[_Part]) -> Float:
+    """What the exposures [n, 3] differ by from those that a smooth function of the other photos' cameras predicts."""
+
+    def fit(kernel: Callable[[Float], Float], share: float) -> tuple[Float, Float]:
+        """The absolute errors in brightness [n], and all errors [n, 3]."""
+        rest = np.zeros_like(exposures)
+        for rows, apart in parts:
+            inverse = _precision(kernel(apart), share)
+            # Times the values: the error of each from all others.
+            rest[rows] = inverse / np.diag(inverse)[:, None] @ exposures[rows]
+        return np.abs(rest.mean(axis=1)), rest
+
+    plain, by_constant = fit(np.zeros_like, 1.0)
+    fits = [(plain, by_constant)]
+    fits += [fit(_smooth_over(reach), share) for reach in REACHES for share in SHARES]
+    least, rest = min(fits, key=lambda each: float(each[0].mean()))
     gain = plain - least
-    if not gain.mean() > CLEAR * gain.std() / np.sqrt(count):
+    if not gain.mean() > CLEAR * gain.std() / np.sqrt(len(exposures)):
         rest = by_constant
     centred: Float = rest - rest.mean(axis=0)
     return centred
 
 
-def _unseen(apart: Float) -> float:
-    """`Light.unseen` of cameras whose squared distances are `apart` [n, n]."""
-    precision = _precision(np.exp(-0.5 * apart / SMOOTH_REACH**2), SMOOTH_NOISE)
+def _unseen(parts: Sequence[_Part]) -> float:
+    """`Light.unseen` of the photos."""
     # What is left of a value that all others predict has one over the diagonal as its variance, noise included.
-    left = 1.0 / np.diag(precision) - SMOOTH_NOISE
-    return float(np.clip(np.median(left), 0.0, 1.0))
+    left = [
+        1.0 / np.diag(_precision(_smooth_over(SMOOTH_REACH)(apart), SMOOTH_NOISE)) - SMOOTH_NOISE
+        for _, apart in parts
+    ]
+    return float(np.clip(np.median(np.concatenate(left)), 0.0, 1.0))
+
+
+def _smooth_over(reach: float) -> Callable[[Float], Float]:
+    """The covariance of what is smooth over `reach`, by squared distances."""
+    return lambda apart: np.exp(-0.5 * apart / reach**2)
 
 
 def _precision(kernel: Float, noise: float) -> Float:
