@@ -8,6 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from splatmill.schema import KnownDistance, ModelFrame
 from splatmill_worker.colmap import pycolmap, write_model
 from splatmill_worker.images.lens import remarks
@@ -19,7 +21,7 @@ from splatmill_worker.sfm import features, stereo
 from splatmill_worker.sfm.callbacks import stop_if
 from splatmill_worker.sfm.colors import color_points
 from splatmill_worker.sfm.final_model import FinalModel
-from splatmill_worker.sfm.posed.colmap_model import posed_view, scene_of
+from splatmill_worker.sfm.posed.colmap_model import camera_and_lens, scene_of
 from splatmill_worker.sfm.posed.model_files import ModelPoints
 from splatmill_worker.sfm.run import SfmRun, torch_threads
 from splatmill_worker.sfm.world.frame import choose, in_frame
@@ -116,9 +118,11 @@ def _views(prepared: Prepared, model: pycolmap.Reconstruction) -> dict[int, View
     by_photo = {features.photo_index(model.images[i].name): i for i in model.reg_image_ids()}
     views = {}
     for index in sorted(by_photo):
-        photo = prepared.photos[index]
-        view = posed_view(model, by_photo[index], photo.name, photo.path, photo.mask)
-        camera = view.camera.scaled_to(photo.width, photo.height)
-        view = replace(view, camera=camera, shown_from=photo.shown_from, upright=True, other=None)
+        photo, image = prepared.photos[index], model.images[by_photo[index]]
+        viewmat = np.eye(4)
+        viewmat[:3] = image.cam_from_world().matrix()
+        camera, lens = camera_and_lens(model.cameras[image.camera_id], viewmat)
+        camera = camera.scaled_to(photo.width, photo.height)
+        view = View(photo.name, camera, photo.path, photo.mask, lens, shown_from=photo.shown_from)
         views[by_photo[index]] = overlays.within_circle(view, photo.circle)
     return views

@@ -144,16 +144,6 @@ def _view(image: GivenImage, name: str, path: Path, mask: Path | None) -> View:
     return replace(view, other=other[0]) if other else view
 
 
-def posed_view(
-    model: pycolmap.Reconstruction, image_id: int, name: str, path: Path, mask: Path | None
-) -> View:
-    """The view of a registered image; its camera is scaled to the size of the file at `path`."""
-    image = model.images[image_id]
-    viewmat = np.eye(4)
-    viewmat[:3] = image.cam_from_world().matrix()
-    return fit_to_file(camera_and_lens(model.cameras[image.camera_id], viewmat), name, path, mask)
-
-
 def camera_and_lens(camera: pycolmap.Camera, viewmat: npt.NDArray[np.float64]) -> tuple[Camera, Lens | None]:
     """The pinhole camera of the undistorted photo, and the lens of the photo itself; None for a pinhole.
 

@@ -64,7 +64,9 @@ def _one_per_cell(points: Float) -> Float:
 
 def _depths(points: Float, rows: Index) -> Float:
     """Depths [k] of the cells `rows` [k, 2] (row, column) from the nearest of `points` (column, row, depth)."""
-    apart = np.square(rows[:, None, ::-1] + 0.5 - points[None, :, :2]).sum(axis=2)
+    apart = np.square(rows[:, None, 1] + 0.5 - points[:, 0]) + np.square(
+        rows[:, None, 0] + 0.5 - points[:, 1]
+    )
     few = min(NEIGHBOURS, len(points))
     near = np.argpartition(apart, few - 1, axis=1)[:, :few]
     inverse: Float = (1.0 / points[near, 2]).mean(axis=1)
