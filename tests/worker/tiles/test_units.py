@@ -75,6 +75,12 @@ def test_what_only_the_cameras_need_is_not_done_once_they_are_there() -> None:
     failed: dict[str, State] = {"photos": "done", "features-1": "failed", "features-2": "done"}
     assert scene.ready(failed) == ["pairs"]
     assert scene.key("cameras", failed) == scene.key("cameras", {})
+    assert scene.key("pairs", failed) == scene.key("pairs", {})
+    lost: dict[str, State] = {"matches-1": "failed"}
+    assert scene.key("cameras", lost) == scene.key("cameras", {})
+    assert scene.key("mapping-2", lost) != scene.key("mapping-2", {}), (
+        "nothing is mapped without these matches"
+    )
 
 
 @pytest.mark.parametrize(

@@ -148,7 +148,7 @@ class ScenePlan:
         own: dict[str, Any] = {"format": FORMAT, "unit": name, "capture": self.digest}
         options = self._chosen
         if name in self.camera_names:
-            # Where a block has failed, a unit after it does that itself, and makes the same.
+            # Where a block has failed, a unit after it does that itself, and makes the same; the mapping does without.
             used: tuple[str, ...] = PHOTO_OPTIONS
             if name in self.mapping_names:
                 used = MAPPING_OPTIONS
@@ -159,6 +159,7 @@ class ScenePlan:
                 own["blocks"] = self.blocks
         else:
             own["options"] = options
+        if self.depends_on_failures(name):
             own["failed"] = [need for need in self.unit(name).optional if states.get(need) == "failed"]
         return hashlib.sha256(json.dumps(own, sort_keys=True).encode()).hexdigest()[:16]
 
@@ -174,7 +175,8 @@ class ScenePlan:
 
     def depends_on_failures(self, name: str) -> bool:
         """Whether the output of a unit is another one where units before it have failed."""
-        return bool(self.unit(name).optional) and name not in self.camera_names
+        optional = bool(self.unit(name).optional)
+        return optional and (name not in self.camera_names or name in self.mapping_names)
 
     def ready(self, states: Mapping[str, State]) -> list[str]:
         """Names of the units that the scene needs, that have not ended and whose needs are met, in the order of the
