@@ -13,28 +13,14 @@ import numpy as np
 import pytest
 import torch
 
-from splatmill.schema import CamerasEvent, Event, ModelCameras, Placement, SnapshotEvent, TrainOptions
+from splatmill.schema import CamerasEvent, Event, ModelCameras, Placement, TrainOptions
 from splatmill_worker import pipeline, sfm, synthetic
 from splatmill_worker.pipeline import live
 from splatmill_worker.scene import Camera, Normalization, Scene, View
-from splatmill_worker.splat.formats import compressed_ply
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.report.export import ExportWorld
 from tests.support import still_life
-
-
-class Audience:
-    """Onlookers who keep what they are shown."""
-
-    def __init__(self, there: bool = True) -> None:
-        self.there = there
-        self.shown: list[tuple[bytes, SnapshotEvent]] = []
-
-    def are_there(self) -> bool:
-        return self.there
-
-    def show(self, ply: bytes, event: SnapshotEvent) -> None:
-        self.shown.append((ply, event))
+from tests.support.audience import Audience, snapshot
 
 
 @pytest.fixture(autouse=True)
@@ -64,18 +50,14 @@ def test_snapshots_are_the_scene_in_the_coordinates_of_the_model(tmp_path: Path)
     ply, event = audience.shown[-1]
     assert event.bytes == len(ply)
     assert 0 < event.step <= 60
-    path = tmp_path / "snapshot.ply"
-    path.write_bytes(ply)
-    snapshot = compressed_ply.read(path).gaussians
+    shown = snapshot(ply, tmp_path)
     model = pipeline_model(outcome)
-    assert snapshot.degree == 0
-    assert abs(snapshot.count - model.count) < 0.2 * model.count
+    assert shown.degree == 0
+    assert abs(shown.count - model.count) < 0.2 * model.count
     # Steps after the snapshot move Gaussians by little of the scene's size, and the still life has no symmetry.
     spread = model.means.std(dim=0)
-    assert torch.allclose(
-        snapshot.means.mean(dim=0), model.means.mean(dim=0), atol=0.05 * float(spread.max())
-    )
-    assert torch.allclose(snapshot.means.std(dim=0), spread, rtol=0.1)
+    assert torch.allclose(shown.means.mean(dim=0), model.means.mean(dim=0), atol=0.05 * float(spread.max()))
+    assert torch.allclose(shown.means.std(dim=0), spread, rtol=0.1)
     seconds = json.loads((outcome.out / "report.json").read_text())["seconds"]
     assert seconds["live"] > 0
 

@@ -123,16 +123,30 @@ class LiveScene:
         """Show the scene as it is."""
         with self._looks.one():
             scene = gaussians_of(run.engine)
-            shown = self._world.gaussians(most_covering(scene.padded(0), MOST_GAUSSIANS))
-            ply = compressed_ply.encode(shown, antialiased=self._antialiased)
-            event = SnapshotEvent(
+            show_scene(
+                self._looks.onlookers,
+                self._world.gaussians(scene.padded(0)),
+                count=scene.count,
+                antialiased=self._antialiased,
                 step=run.state.step,
                 seconds=run.clock.seconds,
-                gaussians=scene.count,
-                shown=shown.count,
-                bytes=len(ply),
             )
-            self._looks.onlookers.show(ply, event)
+
+
+def show_scene(
+    onlookers: Onlookers, scene: Gaussians, *, count: int, antialiased: bool, step: int, seconds: float
+) -> None:
+    """Show a scene of degree 0 in the world of the exported model, or of its Gaussians those that cover the most.
+
+    count: of all its Gaussians, of which `scene` may have a part.
+    step, seconds: of its training so far.
+    """
+    shown = most_covering(scene, MOST_GAUSSIANS)
+    ply = compressed_ply.encode(shown, antialiased=antialiased)
+    onlookers.show(
+        ply,
+        SnapshotEvent(step=step, seconds=seconds, gaussians=count, shown=shown.count, bytes=len(ply)),
+    )
 
 
 def most_covering(gaussians: Gaussians, limit: int) -> Gaussians:

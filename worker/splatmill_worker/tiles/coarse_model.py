@@ -13,8 +13,10 @@ import torch
 from torch import Tensor
 
 from splatmill.files import atomic_write
+from splatmill_worker.scene import Normalization
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.plan.plan import Plan
+from splatmill_worker.splat.report.export import ExportWorld
 from splatmill_worker.splat.report.report import plain
 from splatmill_worker.splat.train.disagreement import Disagreement
 from splatmill_worker.splat.views import TrainingView
@@ -39,6 +41,7 @@ class Coarse:
     facts: what was measured before the training (`Facts.as_dict`).
     disagreements: how far the training photos disagree with one another.
     limited: whether a limit stopped the training from adding Gaussians (`Trained.limited`).
+    world: of the exported model, without its frame.
     """
 
     gaussians: Gaussians
@@ -51,6 +54,7 @@ class Coarse:
     facts: dict[str, Any]
     disagreements: tuple[Disagreement, ...]
     limited: bool
+    world: ExportWorld
 
     @cached_property
     def far(self) -> Tensor:
@@ -72,6 +76,9 @@ class Coarse:
             "facts": plain(self.facts),
             "disagreements": [each[:-1] for each in self.disagreements],
             "limited": self.limited,
+            "scale": self.world.normalization.scale,
+            "translation": self.world.normalization.translation.tolist(),
+            "offset": self.world.offset.tolist(),
         }
         atomic_write(folder / FACTS, json.dumps(document, indent=1))
 
@@ -105,6 +112,10 @@ def read(folder: Path) -> Coarse:
         document["facts"],
         _disagreements(folder, document["disagreements"]),
         bool(document["limited"]),
+        ExportWorld(
+            Normalization(float(document["scale"]), np.array(document["translation"], np.float64)),
+            np.array(document["offset"], np.float64),
+        ),
     )
 
 

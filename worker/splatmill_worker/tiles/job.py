@@ -32,6 +32,7 @@ from splatmill_worker.pipeline.stages import Outcome
 from splatmill_worker.sfm.run import SFM
 from splatmill_worker.tiles.camera_parts import has_parts
 from splatmill_worker.tiles.folder import TILES, Ended, PlanFolder, digest_of, facts_of
+from splatmill_worker.tiles.live import LiveTiles
 from splatmill_worker.tiles.remaining import Remaining
 from splatmill_worker.tiles.retrying import may_pass
 from splatmill_worker.tiles.stages import CHECKPOINTS, PLAN_FILE, Context, run_unit
@@ -114,6 +115,7 @@ class _Work:
     emit: Emit
     cancelled: Callable[[], bool]
     looks: Looks | None
+    live: LiveTiles | None
     others: Others
     entered: list[JobState] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
@@ -155,7 +157,8 @@ def run(
     plan = ScenePlan(digest_of(capture), options)
     folder = PlanFolder(workdir / TILES, plan)
     looks = None if onlookers is None else Looks(onlookers)
-    work = _Work(folder, workdir, emit, cancelled, looks, others or Nobody())
+    live = None if looks is None else LiveTiles(looks, folder)
+    work = _Work(folder, workdir, emit, cancelled, looks, live, others or Nobody())
     choose_kernels(options)
     check_lpips(options)
     folder.save()
@@ -202,6 +205,8 @@ def _step(work: _Work) -> None:
             break
         work.report(name, "elsewhere")
     others.gather(folder)  # what has ended since
+    if work.live is not None:
+        work.live.look()
     if free is None:
         _wait(work, tiles)
     elif free not in folder.states():
@@ -238,6 +243,7 @@ def _do(work: _Work, name: str) -> None:
             _Events(work, name, run.work),
             work.cancelled,
             work.looks,
+            work.live,
             work.workdir / SFM,
             work.workdir if name == "coarse" else None,
         )

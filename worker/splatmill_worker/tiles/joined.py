@@ -131,8 +131,8 @@ def write_scene(joining: Joining) -> dict[str, Any]:
 
 
 def known_cameras(job: Job, stages: Stages) -> Cameras:
-    """The cameras that the unit `cameras` has found. What there is to be said of them was said there."""
-    return recover_cameras(replace(job, emit=lambda event: None), stages)
+    """The cameras that the unit `cameras` has found. What there is to be said of them was said there, and shown."""
+    return recover_cameras(replace(job, emit=lambda event: None, looks=None), stages)
 
 
 def _stated(joining: Joining) -> Plan:

@@ -36,6 +36,7 @@ from splatmill_worker.splat.plan.plan import Kernels, Plan
 from splatmill_worker.tiles import camera_parts, coarse_model, joined
 from splatmill_worker.tiles.cells import divide
 from splatmill_worker.tiles.folder import PlanFolder, Run, facts_of
+from splatmill_worker.tiles.live import LiveTiles
 from splatmill_worker.tiles.tile import COARSE_SHARE, Tile, train_tile
 from splatmill_worker.tiles.units import ScenePlan, seam_name, tile_name, tile_number
 
@@ -52,6 +53,7 @@ class Context:
     emit: called with each event.
     cancelled: polled; the unit ends with Cancelled when it returns true.
     looks: those of onlookers, who see cameras and the coarse model; None where there are none.
+    live: shows them the tiles; None where there are none.
     known: folder of cameras that were recovered before, from which the unit `cameras` begins; None without.
     kept: folder for the plan and the checkpoints of the unit, from which another run of it continues; None: they go
         with the run.
@@ -62,6 +64,7 @@ class Context:
     emit: Emit
     cancelled: Callable[[], bool]
     looks: Looks | None = None
+    live: LiveTiles | None = None
     known: Path | None = None
     kept: Path | None = None
 
@@ -91,7 +94,7 @@ class Context:
         kernels: Kernels = "reference" if options.backend is Backend.reference else "cpu"
         if self.run.name == "coarse":
             kernels = choose_kernels(options)
-        looks = self.looks if self.run.name in ("cameras", "coarse") else None
+        looks = self.looks if self.run.name in ("cameras", "coarse", "scene") else None
         options = options.model_copy(update={"time_lapse": Switch.off})
         return Job(self.folder.capture, work, options, kernels, self.emit, self.cancelled, looks, prepared)
 
@@ -206,6 +209,7 @@ def _coarse(context: Context, stages: Stages) -> dict[str, Any]:
         planned.facts.as_dict(),
         trained.disagreements,
         trained.limited,
+        cameras.exported,
     ).write(context.run.out)
     held_out = trained.held_out
     return {
@@ -242,7 +246,8 @@ def _tile(context: Context, stages: Stages) -> dict[str, Any]:
         )
         return whole, torch.arange(whole.count) >= whole.count - int(coarse.far.sum())
 
-    result = train_tile(Tile(job, coarse, number - 1, scene, last), stages)
+    observers = () if context.live is None else (context.live.of_tile(number - 1),)
+    result = train_tile(Tile(job, coarse, number - 1, scene, last, observers), stages)
     shutil.rmtree(context.run.out)
     context.run.out.mkdir()
     coarse_model.write_gaussians(context.run.out, result.gaussians)

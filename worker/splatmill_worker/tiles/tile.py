@@ -7,7 +7,7 @@ that were trained around it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -30,7 +30,7 @@ from splatmill_worker.splat.plan.plan import Plan
 from splatmill_worker.splat.plan.rates import boost_of
 from splatmill_worker.splat.plan.schedule import MANY_VISITS
 from splatmill_worker.splat.train.loop import Hooks, train
-from splatmill_worker.splat.train.observers import TrainingProgress
+from splatmill_worker.splat.train.observers import Observer, TrainingProgress
 from splatmill_worker.splat.views import TrainingView
 from splatmill_worker.tiles.coarse_model import Coarse
 from splatmill_worker.tiles.visibility import parts
@@ -57,6 +57,7 @@ class Tile:
     scene: reads the Gaussians that its training starts from, of all cells, and which of them are far, bool [N]: these
         stay as they are (see `coarse_model.far`).
     last: this and the tiles around it are trained, but for the last steps.
+    observers: of its training.
     """
 
     job: Job
@@ -64,6 +65,7 @@ class Tile:
     number: int
     scene: Callable[[], tuple[Gaussians, Tensor]]
     last: bool = False
+    observers: Sequence[Observer] = ()
 
 
 @dataclass(frozen=True)
@@ -120,6 +122,7 @@ def train_tile(tile: Tile, stages: Stages) -> TileResult:
             progress=progress,
             warn=lambda sentence: tile.job.emit(LogEvent(level="warning", message=sentence)),
             cancelled=tile.job.cancelled,
+            observers=tile.observers,
             compares=False,
         ),
     )

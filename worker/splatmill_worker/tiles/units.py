@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from splatmill.schema import TrainOptions
 
-FORMAT = 9
+FORMAT = 10
 """Version of the plan's format and of what its units make: another one makes everything anew."""
 
 PHOTO_OPTIONS = ("max_video_frames", "seed", "sfm_effort", "matcher")
