@@ -42,7 +42,8 @@ SMOOTH_NOISE = 0.01
 """Share, as in SHARES, that goes with it."""
 
 TOGETHER = 500
-"""Photos that predict one another, at most: the time for n grows as n³. More are divided by where they were taken."""
+"""Photos that predict one another, at most: the time for n grows as n³. More are divided by where they were taken
+(decisions: TOGETHER)."""
 
 CLEAR = 2.0
 """Standard errors by which the prediction has to be better than a constant: one of many may be so by chance."""
