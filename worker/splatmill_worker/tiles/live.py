@@ -80,11 +80,11 @@ class LiveTiles:
                 if run is not None and index == number:
                     gaussians = gaussians_of(run.engine)
                     inside = torch.from_numpy(cell.holds(gaussians.means.double().numpy()))
-                    parts[index] = _part(gaussians.select(inside), len(coarse.parts))
+                    parts[index] = _part(gaussians.select(inside), 1 / len(coarse.cells))
                 elif outputs:
                     if outputs[-1] not in self._parts:
                         trained = coarse_model.read_gaussians(outputs[-1])
-                        self._parts[outputs[-1]] = _part(trained, len(coarse.parts))
+                        self._parts[outputs[-1]] = _part(trained, 1 / len(coarse.cells))
                     parts[index] = self._parts[outputs[-1]]
             steps = sum(int(each["steps"]) for each in facts)
             seconds = sum(float(each.get("train_seconds", 0.0)) for each in facts)
@@ -115,14 +115,15 @@ class LiveTile:
         self._live.show(self._folder.ended(), self._number, run)
 
 
-def _part(gaussians: Gaussians, parts: int) -> _Part:
-    """What is shown of a part of a scene of so many: at most twice its share of what is shown of all."""
-    return _Part(most_covering(gaussians.padded(0), 2 * MOST_GAUSSIANS // parts), gaussians.count)
+def _part(gaussians: Gaussians, share: float) -> _Part:
+    """What is shown of a part of the scene: at most twice so large a share of what is shown of all."""
+    return _Part(most_covering(gaussians.padded(0), round(2 * share * MOST_GAUSSIANS)), gaussians.count)
 
 
 def _read(path: Path) -> _Coarse:
     coarse = coarse_model.read(path)
     means = coarse.gaussians.means.double().numpy()
     members = [torch.from_numpy(cell.holds(means)) & ~coarse.far for cell in coarse.cells]
-    parts = [_part(coarse.gaussians.select(each), len(members) + 1) for each in (*members, coarse.far)]
+    parts = [_part(coarse.gaussians.select(each), 1 / len(members)) for each in members]
+    parts.append(_part(coarse.gaussians.select(coarse.far), 0.5))
     return _Coarse(coarse.cells, tuple(parts), coarse.world, coarse.plan.antialias)
