@@ -20,7 +20,7 @@ from splatmill_worker.scene import Camera, Normalization, Scene, View
 from splatmill_worker.splat.gaussians import Gaussians
 from splatmill_worker.splat.report.export import ExportWorld
 from tests.support import still_life
-from tests.support.audience import Audience, snapshot
+from tests.worker.audience import Audience, snapshot
 
 
 @pytest.fixture(autouse=True)

@@ -19,7 +19,7 @@ from splatmill_worker.tiles import coarse_model, job
 from splatmill_worker.tiles.folder import PlanFolder, facts_of
 from splatmill_worker.tiles.stages import Context, run_unit
 from tests.support import still_life
-from tests.support.audience import Audience, snapshot
+from tests.worker.audience import Audience, snapshot
 
 pytestmark = pytest.mark.slow
 
