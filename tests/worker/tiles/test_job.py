@@ -22,7 +22,6 @@ from splatmill.schema import (
     PreviewEvent,
     ProgressEvent,
     StateEvent,
-    TrainOptions,
     UnitEvent,
 )
 from splatmill_worker import synthetic
@@ -32,20 +31,9 @@ from splatmill_worker.tiles import job
 from splatmill_worker.tiles.folder import PlanFolder
 from splatmill_worker.tiles.stages import Context, run_unit
 from tests.support import still_life
+from tests.support.plans.tiles import TWO_TILES
 
 pytestmark = pytest.mark.slow
-
-OPTIONS = TrainOptions.model_validate(
-    {
-        "steps": 100,
-        "seed": 1,
-        "max_gaussians": 2000,
-        "holdout": 5,
-        "tiles": 2,
-        "backend": "cpu",
-        "lpips": "off",
-    }
-)
 
 
 class Play(job.Nobody):
@@ -103,7 +91,7 @@ def run(
         if isinstance(event, PreviewEvent | CamerasEvent):
             assert (workdir / event.path).is_file()
 
-    outcome = job.run(capture, workdir, OPTIONS, emit, lambda: cancelled(events), others=others)
+    outcome = job.run(capture, workdir, TWO_TILES, emit, lambda: cancelled(events), others=others)
     return outcome, events
 
 

@@ -12,28 +12,17 @@ from pathlib import Path
 import pytest
 import torch
 
-from splatmill.schema import Event, TrainOptions, UnitEvent
+from splatmill.schema import Event, UnitEvent
 from splatmill_worker.pipeline import live
 from splatmill_worker.splat.formats import ply
 from splatmill_worker.tiles import coarse_model, job
 from splatmill_worker.tiles.folder import PlanFolder, facts_of
 from splatmill_worker.tiles.stages import Context, run_unit
 from tests.support import still_life
+from tests.support.plans.tiles import TWO_TILES
 from tests.worker.audience import Audience, snapshot
 
 pytestmark = pytest.mark.slow
-
-OPTIONS = TrainOptions.model_validate(
-    {
-        "steps": 100,
-        "seed": 1,
-        "max_gaussians": 2000,
-        "holdout": 5,
-        "tiles": 2,
-        "backend": "cpu",
-        "lpips": "off",
-    }
-)
 
 
 class HasSecond(job.Nobody):
@@ -65,7 +54,9 @@ def test_tiles_are_shown_as_they_are_trained_and_the_coarse_model_elsewhere(
         if isinstance(event, UnitEvent) and event.state == "running":
             began[event.unit] = len(audience.shown)
 
-    outcome = job.run(capture, tmp_path, OPTIONS, emit, lambda: False, onlookers=audience, others=HasSecond())
+    outcome = job.run(
+        capture, tmp_path, TWO_TILES, emit, lambda: False, onlookers=audience, others=HasSecond()
+    )
     assert outcome.ended == "succeeded"
     steps = [event.step for _, event in audience.shown]
     assert steps == sorted(steps)
@@ -109,5 +100,5 @@ def test_tiles_are_shown_as_they_are_trained_and_the_coarse_model_elsewhere(
     assert max(counts) - min(counts) <= 0.02 * max(counts)
     assert in_second(shown["seam-1"][0][0]) != counts[-1], "of which the other worker has trained a tile"
     unseen = Audience(there=False)
-    job.run(capture, tmp_path / "again", OPTIONS, events.append, lambda: False, onlookers=unseen)
+    job.run(capture, tmp_path / "again", TWO_TILES, events.append, lambda: False, onlookers=unseen)
     assert not unseen.shown
