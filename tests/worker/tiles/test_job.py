@@ -25,13 +25,14 @@ from splatmill.schema import (
     UnitEvent,
 )
 from splatmill_worker import synthetic
-from splatmill_worker.pipeline import Outcome
+from splatmill_worker.pipeline import Outcome, live
 from splatmill_worker.sfm.mapping import clusters
 from splatmill_worker.tiles import job
 from splatmill_worker.tiles.folder import PlanFolder
 from splatmill_worker.tiles.stages import Context, run_unit
 from tests.support import still_life
 from tests.support.plans.tiles import TWO_TILES
+from tests.worker.audience import Audience
 
 pytestmark = pytest.mark.slow
 
@@ -78,6 +79,7 @@ def run(
     tmp_path: Path,
     others: job.Others,
     cancelled: Callable[[list[Event]], bool] = lambda events: False,
+    onlookers: Audience | None = None,
 ) -> tuple[Outcome, list[Event]]:
     """The outcome and the events of a run in `tmp_path`, which may be one more there."""
     capture, workdir = tmp_path / "capture", tmp_path / "run"
@@ -91,7 +93,9 @@ def run(
         if isinstance(event, PreviewEvent | CamerasEvent):
             assert (workdir / event.path).is_file()
 
-    outcome = job.run(capture, workdir, TWO_TILES, emit, lambda: cancelled(events), others=others)
+    outcome = job.run(
+        capture, workdir, TWO_TILES, emit, lambda: cancelled(events), onlookers=onlookers, others=others
+    )
     return outcome, events
 
 
@@ -207,13 +211,19 @@ def test_features_and_matches_of_others_are_waited_for_and_used(
     assert known.offered == []
 
 
-def test_a_failed_tile_is_said_and_the_scene_is_made_without_it(tmp_path: Path) -> None:
+def test_a_failed_tile_is_said_and_the_scene_is_made_without_it_also_where_somebody_looks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(live, "INTERVAL", 0.0)
+    monkeypatch.setattr(live, "SHARE", 1e9)
+
     def fail(folder: PlanFolder) -> None:
         with folder.claimed("tile-1") as run:
             run.fail("Nothing shows it.", "")
 
-    others = Play(fail)
-    outcome, events = run(tmp_path, others)
+    others, audience = Play(fail), Audience()
+    outcome, events = run(tmp_path, others, onlookers=audience)
+    assert audience.shown[-1][1].step == 50 + 50, "with the coarse model in the cell of tile 1"
     said = [event.message for event in events if isinstance(event, LogEvent) and event.level == "warning"]
     assert any("Tile 1 of 2 failed" in message and "Nothing shows it." in message for message in said)
     report = json.loads((outcome.out / "report.json").read_text())

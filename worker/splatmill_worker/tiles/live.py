@@ -76,6 +76,8 @@ class LiveTiles:
             for index, cell in enumerate(coarse.cells):
                 units = [ended.get(name(index + 1)) for name in (tile_name, seam_name)]
                 outputs = [unit.path for unit in units if unit is not None and unit.path is not None]
+                if units[0] is None or units[0].path is None:
+                    outputs = []  # the last steps of a tile that failed are none, and have no Gaussians
                 facts += map(facts_of, outputs)
                 if run is not None and index == number:
                     gaussians = gaussians_of(run.engine)
