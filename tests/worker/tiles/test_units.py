@@ -76,6 +76,7 @@ def test_what_only_the_cameras_need_is_not_done_once_they_are_there() -> None:
     assert scene.ready(failed) == ["pairs"]
     assert scene.key("cameras", failed) == scene.key("cameras", {})
     assert scene.key("pairs", failed) == scene.key("pairs", {})
+    assert scene.key("mapping-2", failed) == scene.key("mapping-2", {})
     lost: dict[str, State] = {"matches-1": "failed"}
     assert scene.key("cameras", lost) == scene.key("cameras", {})
     assert scene.key("mapping-2", lost) != scene.key("mapping-2", {}), (

@@ -125,7 +125,8 @@ class LiveScene:
             scene = gaussians_of(run.engine)
             show_scene(
                 self._looks.onlookers,
-                self._world.gaussians(scene.padded(0)),
+                scene.padded(0),
+                self._world,
                 count=scene.count,
                 antialiased=self._antialiased,
                 step=run.state.step,
@@ -134,14 +135,22 @@ class LiveScene:
 
 
 def show_scene(
-    onlookers: Onlookers, scene: Gaussians, *, count: int, antialiased: bool, step: int, seconds: float
+    onlookers: Onlookers,
+    scene: Gaussians,
+    world: ExportWorld,
+    *,
+    count: int,
+    antialiased: bool,
+    step: int,
+    seconds: float,
 ) -> None:
-    """Show a scene of degree 0 in the world of the exported model, or of its Gaussians those that cover the most.
+    """Show a scene of degree 0 in the training world, or of its Gaussians those that cover the most.
 
+    world: the coordinates in which it is shown.
     count: of all its Gaussians, of which `scene` may have a part.
     step, seconds: of its training so far.
     """
-    shown = most_covering(scene, MOST_GAUSSIANS)
+    shown = world.gaussians(most_covering(scene, MOST_GAUSSIANS))
     ply = compressed_ply.encode(shown, antialiased=antialiased)
     onlookers.show(
         ply,

@@ -80,7 +80,7 @@ class LiveTiles:
                     outputs = []  # the last steps of a tile that failed are none, and have no Gaussians
                 facts += map(facts_of, outputs)
                 if run is not None and index == number:
-                    gaussians = gaussians_of(run.engine)
+                    gaussians = gaussians_of(run.engine).padded(0)
                     inside = torch.from_numpy(cell.holds(gaussians.means.double().numpy()))
                     parts[index] = _part(gaussians.select(inside), 1 / len(coarse.cells))
                 elif outputs:
@@ -94,7 +94,8 @@ class LiveTiles:
                 steps, seconds = steps + run.state.step, seconds + run.clock.seconds
             show_scene(
                 self._looks.onlookers,
-                coarse.world.gaussians(concatenate(*(part.gaussians for part in parts))),
+                concatenate(*(part.gaussians for part in parts)),
+                coarse.world,
                 count=sum(part.count for part in parts),
                 antialiased=coarse.antialiased,
                 step=steps,
@@ -124,8 +125,9 @@ def _part(gaussians: Gaussians, share: float) -> _Part:
 
 def _read(path: Path) -> _Coarse:
     coarse = coarse_model.read(path)
-    means = coarse.gaussians.means.double().numpy()
+    gaussians = coarse.gaussians.padded(0)
+    means = gaussians.means.double().numpy()
     members = [torch.from_numpy(cell.holds(means)) & ~coarse.far for cell in coarse.cells]
-    parts = [_part(coarse.gaussians.select(each), 1 / len(members)) for each in members]
-    parts.append(_part(coarse.gaussians.select(coarse.far), 0.5))
+    parts = [_part(gaussians.select(each), 1 / len(members)) for each in members]
+    parts.append(_part(gaussians.select(coarse.far), 0.5))
     return _Coarse(coarse.cells, tuple(parts), coarse.world, coarse.plan.antialias)

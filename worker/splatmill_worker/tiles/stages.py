@@ -52,7 +52,8 @@ class Context:
     run: the unit that this process holds.
     emit: called with each event.
     cancelled: polled; the unit ends with Cancelled when it returns true.
-    looks: those of onlookers, who see cameras and the coarse model; None where there are none.
+    looks: those of onlookers, who see cameras and the coarse model, and whose seconds the report has; None where there
+        are none.
     live: shows them the tiles; None where there are none.
     known: folder of cameras that were recovered before, from which the unit `cameras` begins; None without.
     kept: folder for the plan and the checkpoints of the unit, from which another run of it continues; None: they go

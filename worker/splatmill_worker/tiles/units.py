@@ -160,7 +160,9 @@ class ScenePlan:
         else:
             own["options"] = options
         if self.depends_on_failures(name):
-            own["failed"] = [need for need in self.unit(name).optional if states.get(need) == "failed"]
+            # Features of a block that failed are found by `pairs`, which the mapping reads as well.
+            counted = self.match_names if name in self.mapping_names else self.unit(name).optional
+            own["failed"] = [need for need in counted if states.get(need) == "failed"]
         return hashlib.sha256(json.dumps(own, sort_keys=True).encode()).hexdigest()[:16]
 
     def left_out(self, photos: Mapping[str, Any]) -> set[str]:

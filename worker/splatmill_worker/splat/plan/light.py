@@ -110,7 +110,7 @@ def compared(observations: Observations, views: Sequence[TrainingView]) -> Light
     each photo from all others by a Gaussian process over the cameras' positions and directions with a free constant,
     whose reach and noise are those of the least mean error (Rasmussen and Williams 2006, section 5.4.2). The constant
     alone predicts where that is not clearly worse. Of more than TOGETHER photos, those taken near one another predict
-    one another.
+    one another, with a constant of their own.
     """
     exposures, errors = _exposures(observations)
     known = np.isfinite(errors)
