@@ -46,9 +46,9 @@ def recover(
         for what in [what for what in waited if what not in seconds]:
             if (when := waited[what]()) is not False:
                 seconds[what] = (time.monotonic() if when is True else when) - healed
-        if seconds.get("resumes", time.monotonic() - healed) >= within:
-            begun = interrupted(service, clients, struck)
-            limits["resumes"] = within + attempts.busy_with_others(service.records(), healed, begun)
+        if "resumes" not in seconds and time.monotonic() >= healed + within - 1.0:
+            waiting = missing(service, clients, struck, healed)
+            limits["resumes"] = within + attempts.busy_with_others(service.records(), healed, waiting)
         time.sleep(_PAUSE)
     orphans = service.orphans()
     while orphans and time.monotonic() < healed + within:
@@ -57,7 +57,8 @@ def recover(
     late = [what for what, limit in limits.items() if seconds.get(what, limit) >= limit]
     complaint = None
     if late:
-        complaint = f"After {max(limits[what] for what in late):.0f} s the service does not do this: {', '.join(late)}."
+        parts = ", ".join(f"{what} after {limits[what]:.0f} s" for what in late)
+        complaint = f"The service does not do this: {parts}."
         if "resumes" in late:
             waiting = missing(service, clients, struck, healed)
             complaint += f" It has not resumed {sorted(waiting) or 'any job'}."

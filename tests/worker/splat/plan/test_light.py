@@ -5,6 +5,7 @@ Does not prove that photos with corrected light train better: `bench train` meas
 
 from __future__ import annotations
 
+import itertools
 from itertools import pairwise
 
 import numpy as np
@@ -13,7 +14,7 @@ import torch
 
 from splatmill_worker.scene import PointViews, Scene
 from splatmill_worker.splat.plan.facts import measure
-from splatmill_worker.splat.plan.light import TOGETHER, Light, compared
+from splatmill_worker.splat.plan.light import TOGETHER, Light, compared, divided
 from splatmill_worker.splat.plan.observations import Observations
 from splatmill_worker.splat.views import Target, TrainingView
 from splatmill_worker.synthetic import look_at
@@ -103,6 +104,16 @@ def test_light_that_follows_the_camera_is_left_in_and_a_jump_is_taken_out(photos
     departing = on_a_ring(photos, jump)
     assert int(np.abs(departing.departures).max(axis=1).argmax()) == 17
     assert departing.departures[17].mean() == pytest.approx(0.3, abs=0.04)
+
+
+def test_many_photos_are_divided_into_parts_that_lie_apart() -> None:
+    places = np.random.default_rng(0).normal(size=(2 * TOGETHER + 1, 3)) * (9.0, 1.0, 1.0)
+    parts = divided(places)
+    assert sorted(np.concatenate(parts)) == list(range(len(places)))
+    assert sorted(map(len, parts)) == [250, 251, 500]
+    along = sorted((places[part, 0].min(), places[part, 0].max()) for part in parts)
+    assert all(before[1] <= after[0] for before, after in itertools.pairwise(along))
+    assert len(divided(places[:TOGETHER])) == 1
 
 
 def test_what_photos_tell_of_one_another_falls_with_their_distance() -> None:

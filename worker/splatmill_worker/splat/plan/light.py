@@ -123,14 +123,14 @@ def compared(observations: Observations, views: Sequence[TrainingView]) -> Light
     directions = np.array([camera.viewmat[2, :3] for camera in cameras])
     parts = [
         (rows, _squared_distances(places[rows]) + _squared_distances(directions[rows]))
-        for rows in _divided(places)
+        for rows in divided(places)
     ]
     departures = np.zeros_like(exposures)
     departures[known] = _unpredicted(exposures[known], parts)
     return Light(exposures, departures, errors, _unseen(parts))
 
 
-def _divided(points: Float) -> list[npt.NDArray[np.int64]]:
+def divided(points: Float) -> list[npt.NDArray[np.int64]]:
     """Rows of points [n, 3] in parts of at most TOGETHER near ones: halved along the axis of the widest spread."""
     parts, left = list[npt.NDArray[np.int64]](), [np.arange(len(points))]
     while left:
