@@ -15,8 +15,8 @@ service started them, and each role of a process is killed as often as the other
 its worker was killed so often that the next kill might end it by design (`_soak/target.py`).
 
 Within 30 s of a fault's end the service answers, takes a capture and shows a model, every job that had begun has got on
-or ended, and no process has lost its parent (`_soak/recovery.py`); the time in which the only worker trains other jobs
-is not counted for a job that waits for it. One fault in four is followed by the
+or ended, and no process has lost its parent (`_soak/recovery.py`); the time in which the only worker trains other jobs,
+up to a minute, is not counted for a job that waits for it. One fault in four is followed by the
 next at once instead, after which the jobs of both must get on. At the end every job that was accepted has its model, of
 all its photos, or its cancellation, no two attempts at a job ran at once, no step whose checkpoint was stored was taken
 again, no cameras that were stored were recovered again, no attempt did a unit of a scene in tiles again that it or an
@@ -268,12 +268,14 @@ def _storage_part(storage: str, rows: list[Row], names: list[str]) -> list[str]:
     else:
         in_tiles = work.KINDS["tiles"] in end["kinds"]
         units = ", no attempt did a stored unit of a scene in tiles again" if in_tiles else ""
+        within = RESUME_SECONDS * end["patience"]
+        longest = max(row.get("resumes") or 0.0 for row in rows)
+        others = ", the time in which the worker trained other jobs not counted" if longest >= within else ""
         text += [
-            f"Within {RESUME_SECONDS * end['patience']:g} s of every fault that no other followed at once, the service "
-            "answered, took a capture and showed a model, and every job that had begun had got on or ended, the time "
-            "in which the worker trained other jobs not counted. Nothing was lost, no job failed of a fault, every "
-            "model came of all its photos, no two attempts at a job ran at "
-            f"once, no step with a stored checkpoint was taken again{units}, no process was left, every file was "
+            f"Within {within:g} s of every fault that no other followed at once, the service "
+            f"answered, took a capture and showed a model, and every job that had begun had got on or ended{others}. "
+            "Nothing was lost, no job failed of a fault, every model came of all its photos, no two attempts at a "
+            f"job ran at once, no step with a stored checkpoint was taken again{units}, no process was left, every file was "
             "whole, and Redis, storage and the API's lists agreed on every record.",
             "",
         ]

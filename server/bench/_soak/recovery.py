@@ -12,7 +12,7 @@ from _soak.service import Service
 
 RESUME_SECONDS = 30.0
 """Seconds after a fault within which all of it works again, times the patience of the soak. Those in which the worker
-trained other jobs do not count for a job that waits for it."""
+trained other jobs do not count for a job that waits for it, up to twice as many: no job is passed over for ever."""
 
 _PAUSE = 0.02  # seconds between two looks
 
@@ -48,7 +48,8 @@ def recover(
                 seconds[what] = (time.monotonic() if when is True else when) - healed
         if "resumes" not in seconds and time.monotonic() >= healed + within - 1.0:
             waiting = missing(service, clients, struck, healed)
-            limits["resumes"] = within + attempts.busy_with_others(service.records(), healed, waiting)
+            others = attempts.busy_with_others(service.records(), healed, waiting)
+            limits["resumes"] = within + min(others, 2.0 * within)
         time.sleep(_PAUSE)
     orphans = service.orphans()
     while orphans and time.monotonic() < healed + within:

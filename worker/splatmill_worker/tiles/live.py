@@ -1,4 +1,4 @@
-"""The scene of a job in tiles, to those who look at it while its tiles are trained."""
+"""Snapshots of a scene in tiles, for the live view of its job while the tiles are trained."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class LiveTiles:
     def __init__(self, looks: Looks, folder: PlanFolder) -> None:
         self._looks, self._folder = looks, folder
         self._coarse: _Coarse | None = None
-        self._parts: dict[Path, _Part] = {}
+        self._trained: dict[int, tuple[Path, _Part]] = {}
 
     def look(self) -> None:
         """Show the scene by the tiles that have ended, if there is a coarse model, somebody looks, and it is time."""
@@ -74,20 +74,14 @@ class LiveTiles:
             self._coarse = coarse = self._coarse or _read(path)
             facts, parts = [facts_of(path)], list(coarse.parts)
             for index, cell in enumerate(coarse.cells):
-                units = [ended.get(name(index + 1)) for name in (tile_name, seam_name)]
-                outputs = [unit.path for unit in units if unit is not None and unit.path is not None]
-                if units[0] is None or units[0].path is None:
-                    outputs = []  # the last steps of a tile that failed are none, and have no Gaussians
+                outputs = _outputs(ended, index)
                 facts += map(facts_of, outputs)
                 if run is not None and index == number:
                     gaussians = gaussians_of(run.engine).padded(0)
                     inside = torch.from_numpy(cell.holds(gaussians.means.double().numpy()))
                     parts[index] = _part(gaussians.select(inside), 1 / len(coarse.cells))
                 elif outputs:
-                    if outputs[-1] not in self._parts:
-                        trained = coarse_model.read_gaussians(outputs[-1])
-                        self._parts[outputs[-1]] = _part(trained, 1 / len(coarse.cells))
-                    parts[index] = self._parts[outputs[-1]]
+                    parts[index] = self._part_of(index, outputs[-1])
             steps = sum(int(each["steps"]) for each in facts)
             seconds = sum(float(each.get("train_seconds", 0.0)) for each in facts)
             if run is not None:
@@ -101,6 +95,14 @@ class LiveTiles:
                 step=steps,
                 seconds=seconds,
             )
+
+    def _part_of(self, index: int, output: Path) -> _Part:
+        """What is shown of the tile `index` by the output of a unit, which is read once."""
+        if self._trained.get(index, (None,))[0] != output:
+            assert self._coarse is not None
+            trained = coarse_model.read_gaussians(output)
+            self._trained[index] = output, _part(trained, 1 / len(self._coarse.cells))
+        return self._trained[index][1]
 
 
 class LiveTile:
@@ -116,6 +118,14 @@ class LiveTile:
     def observe(self, run: TrainingRun) -> None:
         """Show the scene as it is."""
         self._live.show(self._folder.ended(), self._number, run)
+
+
+def _outputs(ended: Mapping[str, Ended], index: int) -> list[Path]:
+    """The outputs of the units that have trained the tile `index`; none where it failed, whatever came after that."""
+    units = ended.get(tile_name(index + 1)), ended.get(seam_name(index + 1))
+    if units[0] is None or units[0].path is None:
+        return []
+    return [unit.path for unit in units if unit is not None and unit.path is not None]
 
 
 def _part(gaussians: Gaussians, share: float) -> _Part:

@@ -5,7 +5,6 @@ Does not prove that photos with corrected light train better: `bench train` meas
 
 from __future__ import annotations
 
-import itertools
 from itertools import pairwise
 
 import numpy as np
@@ -112,7 +111,7 @@ def test_many_photos_are_divided_into_parts_that_lie_apart() -> None:
     assert sorted(np.concatenate(parts)) == list(range(len(places)))
     assert sorted(map(len, parts)) == [250, 251, 500]
     along = sorted((places[part, 0].min(), places[part, 0].max()) for part in parts)
-    assert all(before[1] <= after[0] for before, after in itertools.pairwise(along))
+    assert all(before[1] <= after[0] for before, after in pairwise(along))
     assert len(divided(places[:TOGETHER])) == 1
 
 
