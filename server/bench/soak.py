@@ -275,8 +275,8 @@ def _storage_part(storage: str, rows: list[Row], names: list[str]) -> list[str]:
             f"Within {within:g} s of every fault that no other followed at once, the service "
             f"answered, took a capture and showed a model, and every job that had begun had got on or ended{others}. "
             "Nothing was lost, no job failed of a fault, every model came of all its photos, no two attempts at a "
-            f"job ran at once, no step with a stored checkpoint was taken again{units}, no process was left, every file was "
-            "whole, and Redis, storage and the API's lists agreed on every record.",
+            f"job ran at once, no step with a stored checkpoint was taken again{units}, no process was left, "
+            "every file was whole, and Redis, storage and the API's lists agreed on every record.",
             "",
         ]
     text += [f"Not run: {name}, because {why}." for name, why in end["left_out"].items()]
