@@ -511,6 +511,18 @@ def test_the_official_protocol_trains_its_own_scene_alone(
     assert "leave out --scenes, --configs and --peer" in capsys.readouterr().err
 
 
+def test_the_official_protocol_trains_over_white_as_the_published_figures_were(
+    parts: Any, tmp_path: Path
+) -> None:
+    scenes = parts["_train.scenes"]
+    try:
+        official, lego = (scenes.named(name, tmp_path) for name in (scenes.OFFICIAL, "lego"))
+    except FileNotFoundError as error:
+        pytest.skip(str(error))
+    assert official.options == {"image_size": 800, "holdout": 8, "background": "white"}
+    assert "background" not in lego.options
+
+
 @pytest.mark.parametrize("name", ["lund", "kermit", "beer", "snowmiku"])
 def test_a_scene_whose_cameras_are_recovered_brings_none(parts: Any, tmp_path: Path, name: str) -> None:
     try:

@@ -35,6 +35,10 @@ KNOWN = ("fox", "lego", "lund", "kermit", "synthetic", "beer", "snowmiku")
 OFFICIAL = "lego-800"
 """lego at its published size, for `bench train --official`."""
 
+PUBLISHED: dict[str, Any] = {"image_size": 800, "holdout": 8, "background": "white"}
+"""Its options. Training is over white too, as 3DGS trains on it; without the option it is over random colours, so that
+the model is transparent over any (decisions: random-background)."""
+
 FOLDED = "beer-folded"
 """beer with the cameras that came with it, which lay two sides of the room on each other (decisions: unfold)."""
 
@@ -86,8 +90,8 @@ def named(text: str, work: Path) -> Scene:
         if text in ("beer", "snowmiku"):
             return Scene(text, _photos_alone(folder, work / text / "capture"))
         if text in ("lego", OFFICIAL):
-            lego = {"image_size": 800 if text == OFFICIAL else 400, "holdout": 8}
-            return Scene(text, folder, lego, transparent=True, points=False, posed=True)
+            options = {"image_size": 400, "holdout": 8} if text == "lego" else PUBLISHED
+            return Scene(text, folder, options, transparent=True, points=False, posed=True)
         return Scene(text, folder, posed=text in (FOLDED, "fox"))
     folder = Path(text)
     if not folder.is_dir():
