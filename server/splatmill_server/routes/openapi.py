@@ -7,7 +7,6 @@ from splatmill.schema import PROBLEM_MEDIA_TYPE, PROBLEMS, Problem
 Responses = dict[int | str, dict[str, Any]]
 
 CAPTURE_ID = "9f2b6c1d04e8a735"
-JOB_ID = "4c7d10aa83f25e96"
 
 CAPTURE_EXAMPLE = {
     "id": CAPTURE_ID,

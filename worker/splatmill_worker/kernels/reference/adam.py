@@ -32,9 +32,10 @@ def adam_(
 
     step counts from 1; the bias is corrected by it for all rows, whenever they came (decisions: bias-correction). With
     visible [N] (bool) only those rows move; last_step int32 [N] is the step up to which each row is current, and a row
-    that missed steps is first brought to where dense Adam with zero gradients would have left it (`catch_up_`). beta2
-    is the same in every step, LEAST_BETA2 or more and below 1. An entry whose gradient, or the gradient's square, is
-    not finite stays as it is. Returns the number of such entries. Raises ValueError for visible without last_step.
+    that missed steps is first brought, by `catch_up_`, to where dense Adam with zero gradients would have left it
+    (decisions: moments-out-of-view). beta2 is the same in every step, LEAST_BETA2 or more and below 1. An entry whose
+    gradient, or the gradient's square, is not finite stays as it is. Returns the number of such entries. Raises
+    ValueError for visible without last_step.
 
     float32 state does not underflow: eps outweighs the root of the second moment v where v < 1e-30, while float32 holds
     v down to 1e-38. A gradient whose square is 0 in float32 moves its parameter by less than rate * 1e-3.

@@ -6,6 +6,7 @@ import copy
 from collections.abc import Sequence
 
 from splatmill_worker.colmap import pycolmap
+from splatmill_worker.sfm.mapping.registered import without_points
 
 MIN_SHARED = 3
 """Photos registered in both models; fewer do not determine the scale of the similarity reliably."""
@@ -70,11 +71,7 @@ def _add(whole: pycolmap.Reconstruction, aligned: pycolmap.Reconstruction) -> No
             whole.frames[whole.images[image_id].frame_id].set_cam_from_world(image.camera_id, pose)
             whole.register_frame(whole.images[image_id].frame_id)
             continue
-        features = pycolmap.Point2DList([pycolmap.Point2D(point.xy) for point in image.points2D])
-        fresh = pycolmap.Image(
-            name=image.name, camera_id=image.camera_id, image_id=image_id, points2D=features
-        )
-        whole.add_image_with_trivial_frame(fresh, pose)
+        whole.add_image_with_trivial_frame(without_points(image), pose)
     for point in aligned.points3D.values():
         free, known = [], set()
         for element in point.track.elements:

@@ -40,7 +40,8 @@ GROWTH, UNEVEN_GROWTH = 0.7, 0.5
 (decisions: growth-until)."""
 
 DROPOUT = 0.2
-"""Largest share of the Gaussians that a step leaves out: the value of Park et al. 2025 (decisions: dropout)."""
+"""Largest share of the Gaussians that a step leaves out: the value of Park et al. 2025 (decisions: dropout). Each is
+drawn by itself, not with its neighbours (decisions: neighbour-dropout)."""
 
 
 def decide(facts: Facts, options: TrainOptions, kernels: Kernels) -> Plan:

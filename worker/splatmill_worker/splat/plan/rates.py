@@ -38,7 +38,7 @@ class Annealing:
 
     The rate of the positions falls exponentially over the whole run. The others stay constant, then fall by half a
     cosine: with Adam, the last step size remains as noise in the parameters. A mean of the last parameters gains
-    nothing beside it (decisions: averaged-parameters).
+    nothing beside it (decisions: averaged-parameters). Other courses over-fit no less (decisions: over-fit-of-lego).
 
     boost: factor on the paper's rates. With Adam, a parameter moves by at most about its rate in each step, so a run
         shorter than the paper's needs higher rates. Opacities take the root of the factor, since they saturate;

@@ -20,7 +20,7 @@ from splatmill_worker.splat.train.density.rows import Rows
 
 THRESHOLD = 2e-4
 """Mean gradient of the projected mean, in NDC units, above which a Gaussian is split. The value of Kerbl et al.
-(decisions: densification-score)."""
+(decisions: densification-score). None are added elsewhere (decisions: error-points)."""
 
 OFFSET = 1.0
 """Distance of each half from the mean of the Gaussian, along its longest axis, over its standard deviation there."""
@@ -48,7 +48,8 @@ def densify(
     """Prune, then split the Gaussians whose mean gradient is above THRESHOLD.
 
     allowed: most Gaussians afterwards; those with the largest mean gradient are split first.
-    opacity_decay: factor on the opacities of the Gaussians that stay as they are.
+    opacity_decay: factor on the opacities of the Gaussians that stay as they are. Their sizes stay (decisions:
+        scale-decay).
     decay_within: distance from the origin, in the training world, up to which opacities decay.
     """
     before = engine.count
