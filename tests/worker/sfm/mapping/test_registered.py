@@ -44,7 +44,7 @@ def model() -> pycolmap.Reconstruction:
 
 def observed(model: pycolmap.Reconstruction) -> set[tuple[int, int, tuple[float, ...]]]:
     """Image, feature and place of every observation, by the tracks; the photos have to agree."""
-    found = {
+    by_track = {
         (each.image_id, each.point2D_idx, tuple(point.xyz))
         for point in model.points3D.values()
         for each in point.track.elements
@@ -54,8 +54,8 @@ def observed(model: pycolmap.Reconstruction) -> set[tuple[int, int, tuple[float,
         for image_id, image in model.images.items()
         for feature in image.get_observation_point2D_idxs()
     }
-    assert found == by_photo
-    return found
+    assert by_track == by_photo
+    return by_track
 
 
 def test_a_photo_for_another_model_has_its_features_and_observes_nothing(
