@@ -38,14 +38,14 @@ class Annealing:
 
     The rate of the positions falls exponentially over the whole run. The others stay constant, then fall by half a
     cosine: with Adam, the last step size remains as noise in the parameters. A mean of the last parameters gains
-    nothing beside it (decisions: averaged-parameters). Other courses over-fit no less (decisions: over-fit-of-lego).
+    nothing beside it (decisions: averaged-parameters).
 
     boost: factor on the paper's rates. With Adam, a parameter moves by at most about its rate in each step, so a run
         shorter than the paper's needs higher rates. Opacities take the root of the factor, since they saturate;
         spherical harmonics above degree 0 take more (see MOST_SH). None: `boost_of` the number of steps that a time
         budget is measured to allow.
     position_fall: last rate of the positions over the first.
-    hold: share of the budget for which the other rates stay constant.
+    hold: share of the budget for which the other rates stay constant (decisions: over-fit-of-lego).
     rest_fall: last value of the other rates over the first.
     beta2: Adam's factor on the second moments at each step.
     begin, end: the part of the fall that a run takes, 0 to 1, where another run takes the rest.
